@@ -167,7 +167,7 @@ def _decode(data: bytes, path: Path, flags: int) -> np.ndarray:
     width, height = _declared_size(data)
     if width * height > MAX_PIXELS:
         raise UserError(f"{path} claims to have {width}x{height} pixels; images of more than {MAX_PIXELS} are not read")
-    if data.startswith(_JPEG_START) and data.find(bytes(_most_zeros(data, width, height) + 1), begin, end) >= 0:
+    if data.startswith(_JPEG_START) and _has_hole(data, begin, end, _most_zeros(data, width, height)):
         raise UserError(f"{path} is damaged: a part of its image data is zero; write or copy it again")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -195,6 +195,12 @@ def _image_data(data: bytes) -> tuple[int, int]:
     video, and some writers pad."""
     begin = next((at for marker, at in _segments(data) if marker == _JPEG_SCAN), 0)  # decoders refuse what has none
     return begin, data.find(_JPEG_END, begin)
+
+
+def _has_hole(data: bytes, begin: int, end: int, most: int) -> bool:
+    """Whether more than `most` zero bytes follow each other, up to the end marker not counted: some cameras pad there."""
+    hole = data.find(bytes(most + 1), begin, end)
+    return hole >= 0 and bool(data[hole:end].strip(b"\0"))
 
 
 def _most_zeros(data: bytes, width: int, height: int) -> int:

@@ -132,6 +132,16 @@ def test_a_jpeg_with_a_hole_is_refused(options: tuple[int, ...], tmp_path: Path)
         read_image(path)
 
 
+def test_zeros_before_the_end_marker_are_no_hole(tmp_path: Path) -> None:
+    """As some cameras pad their pictures."""
+    picture, path = np.random.default_rng(0).integers(0, 256, (160, 240, 3), np.uint8), tmp_path / "x.jpg"
+    data = cv2.imencode(".jpg", picture)[1].tobytes()
+    path.write_bytes(data)
+    whole = read_image(path)
+    path.write_bytes(data[:-2] + bytes(3000) + data[-2:])
+    np.testing.assert_array_equal(read_image(path), whole)
+
+
 @pytest.mark.parametrize("options", HUFFMAN)
 @pytest.mark.parametrize("shape", [(1, 1, 3), (500, 900), (500, 900, 3)])
 def test_a_flat_jpeg_has_no_hole(shape: tuple[int, ...], options: tuple[int, ...], tmp_path: Path) -> None:

@@ -34,9 +34,7 @@ _SAMPLES = 16  # pictures of a video of mattes
 class OwnMattes:
     footage: Footage
     notes: tuple[str, ...] = ()
-    later: float = (
-        0.0  # seconds by which the video's first picture is later in its file than the first of these in theirs
-    )
+    later: float = 0.0  # seconds: when the video's first picture is in its file, less when the first matte is in its own
 
     def turned(self, degrees: int) -> OwnMattes:
         return replace(self, footage=turned(self.footage, degrees))
