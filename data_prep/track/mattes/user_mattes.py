@@ -34,7 +34,9 @@ _SAMPLES = 16  # pictures of a video of mattes
 class OwnMattes:
     footage: Footage
     notes: tuple[str, ...] = ()
-    later: float = 0.0  # seconds: when the video's first picture is in its file, less when the first matte is in its own
+    later: float = (
+        0.0  # seconds: when the video's first picture is in its file, less when the first matte is in its own
+    )
 
     def turned(self, degrees: int) -> OwnMattes:
         return replace(self, footage=turned(self.footage, degrees))
