@@ -88,6 +88,7 @@ def test_a_run_begun_with_weights_does_not_go_on_without_them(
     assert newest_checkpoint(run).step == 8
 
 
+@pytest.mark.usefixtures("ctrl_c_works")
 def test_a_run_that_is_stopped_at_once_says_what_is_saved(
     own_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -144,14 +144,6 @@ def test_another_seed_is_another_avatar(tracked_folder: Path, tmp_path: Path) ->
     a, _ = train_small(tracked_folder, tmp_path / "a", ["trainer.seed=1"])
     b, _ = train_small(tracked_folder, tmp_path / "b", ["trainer.seed=2"])
     assert not torch.equal(a.deformation.output.weight, b.deformation.output.weight)
-
-
-@pytest.fixture
-def ctrl_c_works() -> Iterator[None]:
-    """SIGINT is ignored where the tests run in the background of a shell."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("ctrl_c_works")
