@@ -45,7 +45,10 @@ def test_adam_moves_the_last_of_many_values(tmp_path: Path, monkeypatch: pytest.
     def sparse(name: str) -> torch.Tensor:  # with room before it, for what is taken for a negative number
         return torch.from_file(str(tmp_path / name), shared=True, size=2 * MANY + LANES)[MANY:]
 
-    parameter, gradient, mean, square = map(sparse, ("parameter", "gradient", "mean", "square"))
+    try:
+        parameter, gradient, mean, square = map(sparse, ("parameter", "gradient", "mean", "square"))
+    except RuntimeError as error:
+        pytest.skip(f"a sparse file of 16 GiB cannot be made here: {error}")
     gradient[MANY:] = 2.0
     one, zero = torch.ones(()), torch.zeros(())
     builder = interpreter.interpreter_builder
