@@ -39,6 +39,7 @@ def rate(page: Page, seconds: float = 2.0) -> float:
     page.set("Motion", "neutral face")
     page.set("Motion", "train")
     page.set("Reset face", True)
+    page.read(0.3)  # choices and buttons are handled side by side, in any order
     page.set("Pause" if "Pause" in page.controls else "Play", True)
     page.next_picture()
     begin, before = time.monotonic(), page.pictures
