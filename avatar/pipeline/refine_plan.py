@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -111,10 +112,10 @@ def affordable_iterations(seconds: float, step: float, refinement: float, rounds
 
 
 def steps_in_time(
-    source: Source, overrides: list[str], rounds: int, minutes: float | None, spent: float
+    source: Source, overrides: list[str], rounds: int, minutes: float | None, begin: float
 ) -> tuple[int, int]:
-    """Steps of the run itself and of each round: the configuration's, or as many as the minutes less `spent` seconds allow
-    by what this machine shows on a few.
+    """Steps of the run itself and of each round: the configuration's, or as many as the minutes allow that began at
+    `begin`, of `time.monotonic`, by what this machine shows on a few; these count, as preparing the subject does.
 
     Raises UserError where they allow too few.
     """
@@ -130,6 +131,7 @@ def steps_in_time(
     frame = subject.frame(subject.split.train[0], config.data.size)
     cost = measure_cost(frame, subject, assets, config)
     step, starts = cost.step_seconds, cost.start_seconds * (1 + rounds)
+    spent = time.monotonic() - begin
     able = affordable_iterations(plannable(minutes) - spent - starts, step, refinement, rounds, frames)
     fewest = min(LEAST_STEPS, asked)
     if able < fewest:

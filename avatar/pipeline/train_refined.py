@@ -30,7 +30,7 @@ def begin_rounds(
 ) -> int:
     """The minutes are counted from `begin` on, of `time.monotonic`: they include the tracking of a video."""
     refuse_features(load_config(overrides).model, "--refine")
-    iterations, in_rounds = steps_in_time(source, overrides, rounds, minutes, time.monotonic() - begin)
+    iterations, in_rounds = steps_in_time(source, overrides, rounds, minutes, begin)
     plan = Plan(rounds, source, tuple(overrides), minutes, iterations, in_rounds, time.monotonic() - begin)
     with locked(run / ROUNDS_FOLDER):
         plan.save(run)

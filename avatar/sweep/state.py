@@ -50,15 +50,18 @@ def write_sweep(folder: Path, spec: Spec) -> list[str]:
 
     Raises UserError for a folder that holds another sweep's jobs.
     """
-    before = [job.name for job in read_sweep(folder).jobs] if (folder / SWEEP_FILE).is_file() else []
+    before = _read_sweep_file(folder).get("jobs", []) if (folder / SWEEP_FILE).is_file() else []
+    new = []
     for job in spec.jobs:
         place = folder / "jobs" / job.name
         if not (place / "job.json").is_file():
-            write_atomically(place / "job.json", json.dumps(asdict(job), indent=1, allow_nan=False).encode())
+            new.append((place, job))
         elif read_job(place) != job:
             raise UserError(
                 f"{folder} holds a sweep in which {job.name} is something else; choose another --out, or delete it"
             )
+    for place, job in new:
+        write_atomically(place / "job.json", json.dumps(asdict(job), indent=1, allow_nan=False).encode())
     names = [job.name for job in spec.jobs]
     content = {
         "format": SWEEP_FORMAT,
@@ -67,14 +70,12 @@ def write_sweep(folder: Path, spec: Spec) -> list[str]:
         "retries": spec.retries,
     }
     write_atomically(folder / SWEEP_FILE, json.dumps(content, indent=1, allow_nan=False).encode())
-    return sorted({*before} - {*names})
+    return sorted({*map(str, before)} - {*names}) if isinstance(before, list) else []
 
 
 def read_sweep(folder: Path) -> Spec:
     """The sweep in a folder. Raises UserError where there is none."""
-    raw = _read_json(folder / SWEEP_FILE, f"{folder} holds no sweep; start one with avatar sweep SPEC.yaml --out")
-    if raw.get("format") != SWEEP_FORMAT:
-        raise UserError(f"{folder / 'sweep.json'} was written by another version of this program; start a new sweep")
+    raw = _read_sweep_file(folder)
     try:
         resources = Resources(**raw["resources"])
         return Spec(
@@ -134,6 +135,13 @@ def heartbeat_age(folder: Path) -> float:
         return time.time() - (folder / "heartbeat").stat().st_mtime
     except FileNotFoundError:
         return float("inf")
+
+
+def _read_sweep_file(folder: Path) -> Mapping[str, Any]:
+    raw = _read_json(folder / SWEEP_FILE, f"{folder} holds no sweep; start one with avatar sweep SPEC.yaml --out")
+    if raw.get("format") != SWEEP_FORMAT:
+        raise UserError(f"{folder / 'sweep.json'} was written by another version of this program; start a new sweep")
+    return raw
 
 
 def _read_json(path: Path, absent: str) -> Mapping[str, Any]:

@@ -75,6 +75,8 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(
     for fact in ("frames to train on", "about", "20 steps", "Memory", "Disk", "model.uv_size=16"):
         assert fact in said
     assert list(tmp_path.iterdir()) == []
+    refused = avatar("train", tracked_folder, "--dry-run", "--refine", 1, "model=gaussianheadavatar", status=1)
+    assert "--refine" in refused
     assert "is a video" in avatar("train", (film := tmp_path / "a.mp4").touch() or film, "--dry-run", status=1)
 
 

@@ -162,11 +162,6 @@ def test_training_in_rounds(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert "holds a run already" in avatar("train", folder, "--out", run, "--refine", 1, *QUICK, status=1)
 
 
-def test_a_dry_run_refuses_what_training_in_rounds_refuses(folder: Path) -> None:
-    words = ("train", folder, "--frame-offset", 1, "--dry-run", "--refine", 1, "model=gaussianheadavatar", *QUICK)
-    assert "--refine" in avatar(*words, status=1)
-
-
 def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = tmp_path / "run"
     words = ["train", folder, "--out", run, "--frame-offset", 1, *QUICK, "trainer.iterations=1000"]
@@ -181,7 +176,7 @@ def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monk
     monkeypatch.setattr(refine_plan, "measure_cost", lambda *_: SimpleNamespace(start_seconds=0.0, step_seconds=2.5))
     monkeypatch.setattr(refine_plan, "LEAST_STEPS", 5)
     ticks = iter((0.0, 0.0, 1.0, 1.0, 11.0, 31.0, 57.0))
-    for module in (train, train_refined):
+    for module in (train, train_refined, refine_plan):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(ticks)))
     output = avatar(*words, "--refine", 1, "--minutes", 1)
     assert "allow 10 steps; 10 are taken" in output and "of 1 minutes" in output
@@ -202,21 +197,25 @@ def test_the_minutes_include_tracking(folder: Path, tmp_path: Path, monkeypatch:
         clock[0] += 90.0
         return source_of(arguments)
 
-    for module in (train, train_refined):
+    def measured(*_: object) -> float:
+        clock[0] += 20.0  # which preparing the subject comes before
+        return 10.0
+
+    for module in (train, train_refined, refine_plan):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     monkeypatch.setattr(train, "tracked_source", tracked)
-    monkeypatch.setattr(refine_plan, "estimated_seconds", lambda *_: 10.0)
+    monkeypatch.setattr(refine_plan, "estimated_seconds", measured)
     monkeypatch.setattr(refine_plan, "measure_cost", lambda *_: SimpleNamespace(start_seconds=5.0, step_seconds=0.05))
     assert "must be from 1 to 10" in avatar(*words, "--refine", 99, "--minutes", 5, status=1)
     assert clock == [0.0]
     monkeypatch.setattr(train_refined, "train_round", lambda plan, *_: (0, plan))
     monkeypatch.setattr(train_refined, "continue_or_begin", lambda *_: 0)
     output = avatar(*words, "--refine", 1, "--minutes", 5)
-    # 0.97 of 300 seconds less 90, 10 and two starts of 5, by a twentieth of a second a step, less the round's 1,000
-    assert "5 minutes, 90 s of them gone" in output and "1.5 of 5 minutes" in output
-    assert "allow 2,620 steps; 1,000 are taken" in output
+    # 0.97 of 300 seconds less 110, 10 and two starts of 5, by a twentieth of a second a step, less the round's 1,000
+    assert "5 minutes, 110 s of them gone" in output and "1.8 of 5 minutes" in output
+    assert "allow 2,220 steps; 1,000 are taken" in output
     refused = avatar(*words[:3], tmp_path / "other", *words[4:], "--refine", 1, "--minutes", 2, status=1)
-    assert "90 s are gone" in refused and "give at least 2.7" in refused
+    assert "110 s are gone" in refused and "give at least 3.1" in refused
 
 
 def first(run: Path) -> Path:

@@ -7,6 +7,7 @@ import csv
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import threading
 import time
@@ -17,8 +18,10 @@ from command_line import avatar
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
+from avatar.errors import UserError
 from avatar.runs.checkpoint import list_checkpoints
-from avatar.sweep.state import State, read_state, write_state
+from avatar.sweep.spec import Job, Resources, Spec
+from avatar.sweep.state import State, read_state, read_sweep, write_state, write_sweep
 
 ENGINES = {"local": "json", "ray": "ray", "slurm": "submitit"}
 OPTIONS = {"local": (), "ray": (), "slurm": ("--address", "local")}
@@ -128,6 +131,26 @@ def test_status_and_another_try(place: Path, tmp_path: Path) -> None:
     assert "1 jobs: 0 done" in avatar("sweep", "--out", folder, "--status", status=1)
     assert "holds a sweep in which" in avatar("sweep", another, "--out", folder, status=1)
     assert "Note:" not in avatar("sweep", more, "--out", folder, "--workers", 1, status=1)
+
+
+def test_a_sweep_that_is_refused_writes_no_job(tmp_path: Path) -> None:
+    def spec(*words: str) -> Spec:
+        common = {"subject": "a", "seed": 0, "source": {"folder": "a"}, "protocols": ()}
+        named = (word.partition(":") for word in words)
+        return Spec(
+            tuple(Job(name, variant=name, overrides=(own,), **common) for name, _, own in named), Resources(), 2
+        )
+
+    write_sweep(tmp_path, spec("b:1"))
+    with pytest.raises(UserError, match="in which b is something else"):
+        write_sweep(tmp_path, spec("a:1", "b:2"))
+    assert not write_sweep(tmp_path, spec("a:2", "b:1", "c:1")), "a was never in the sweep"
+    assert read_sweep(tmp_path) == spec("a:2", "b:1", "c:1")
+
+    for name in ("a", "c"):
+        shutil.rmtree(tmp_path / "jobs" / name)
+    assert write_sweep(tmp_path, spec("a:3", "b:1")) == ["c"], "whose folder a person deleted, as that of a"
+    assert read_sweep(tmp_path) == spec("a:3", "b:1")
 
 
 def test_a_worker_that_fell_silent_is_replaced(tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ class PictureFolder(Footage):
         was_transparent = False
         times = self.times or [n / self.rate for n in range(len(self.files))]
         both = zip(times, self.files, strict=True)
-        inside = [(t, f) for t, f in both if t >= span.start - 1e-6 and (span.end is None or t < span.end)]
+        inside = [(t, f) for t, f in both if t >= span.start - 1e-6 and (span.end is None or t < span.end - 1e-6)]
         for time, file in inside[:: every or stride(self.rate)]:
             image, is_transparent = self.decode(file)
             was_transparent |= is_transparent

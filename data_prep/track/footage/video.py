@@ -71,7 +71,7 @@ class Video(Footage):
                     f"pixels after {n} pictures; cut it there, or give --start or --end"
                 )
             time = offset + (n / (self.rate or 25.0) if shown.time is None else shown.time)
-            if span.end is not None and time >= span.end:
+            if span.end is not None and time >= span.end - 1e-6:
                 _report_damage(decoder, decoder.heard, complain)
                 break
             last = time
