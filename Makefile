@@ -83,6 +83,8 @@ clean: ## remove everything that the other targets make
 $(VENV)/.tools: constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
 	  || { echo "avatar needs Python 3.11 or newer as $(PYTHON); name another one with make setup PYTHON=..."; exit 1; }
+	@$(PYTHON) -c 'import os, sys, sysconfig; sys.exit(not os.path.exists(sysconfig.get_path("include") + "/Python.h"))' \
+	  || { echo "avatar needs the headers of $(PYTHON) (Debian: apt install python3-dev; Fedora: dnf install python3-devel)"; exit 1; }
 	@command -v c++ >/dev/null || command -v g++ >/dev/null || command -v clang++ >/dev/null \
 	  || { echo "avatar needs a C++ compiler (Debian: apt install g++; macOS: xcode-select --install)"; exit 1; }
 	@$(PYTHON) -m venv $(VENV) \

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -34,6 +35,16 @@ def test_developers_targets_install_their_tools_once(target: str, tmp_path: Path
     for name in (".tools", ".installed", ".installed-dev"):
         (tmp_path / "used" / name).touch()
     assert "-e '.[" not in commands(target, tmp_path / "used") and "-e '.[" not in commands("demo", tmp_path / "used")
+
+
+def test_missing_headers_of_python_are_said_before_anything_is_installed(tmp_path: Path) -> None:
+    if shutil.which("make") is None:
+        pytest.skip("make is not installed")
+    (tmp_path / "sysconfig.py").write_text("def get_path(name): return '/nowhere'\n")
+    words = ["make", "setup", f"VENV={tmp_path / 'new'}", f"PYTHON=PYTHONPATH={tmp_path} {sys.executable}"]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode != 0 and "headers" in done.stdout and "python3-dev" in done.stdout
+    assert not (tmp_path / "new").exists()
 
 
 def test_slow_tests_are_left_to_test_all(tmp_path: Path) -> None:
