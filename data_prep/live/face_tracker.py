@@ -168,8 +168,8 @@ class LiveFaceTracker:
         equivalent = self.pictures.source.equivalent_focal
         focal = choose_focal(*size, points, field_of_view=self._field_of_view, equivalent=equivalent).pixels
         camera = Pinhole(focal, focal, size[0] / 2, size[1] / 2)
-        fit = fit_landmarks(self._assets, self._assets.names, self._embedding, landmarks, camera)
-        self._fit = FrameFit(self._assets, self._assets.names, self._embedding, fit, camera, size)
+        fit = fit_landmarks(self._assets, self._embedding, landmarks, camera)
+        self._fit = FrameFit(self._assets, self._embedding, fit, camera, size)
         self._expressions = fit.expressions
         return Calibration(_identity(fit), _as_faces(fit.motion, times, fit.expressions, self._assets))
 
