@@ -20,8 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from avatar.bench.clock import paired_medians
-from avatar.bench.splat_gpu import synchronize
+from avatar.bench.clock import paired_medians, synchronize
 from avatar.pipeline.choose_device import choose_device
 from avatar.runs.run import open_trained
 from avatar.splat import splat

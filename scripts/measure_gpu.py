@@ -19,8 +19,8 @@ import triton
 from count_launches import Rehearsal
 from torch import Tensor
 
-from avatar.bench.clock import Time, paired_medians
-from avatar.bench.splat_gpu import device_of, synchronize
+from avatar.bench.clock import Time, paired_medians, synchronize
+from avatar.bench.splat import device_of
 from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import CPU, interpreted
 from avatar.demo.head import demo_head

@@ -122,10 +122,10 @@ def measure_fit(assets: HeadAssets, head: Path, video: Path) -> None:
     focal = choose_focal(*size, points, equivalent=footage.equivalent_focal).pixels
     camera = Pinhole(focal, focal, size[0] / 2, size[1] / 2)
     embedding = find_embedding(head, assets)
-    clip = fit_landmarks(assets, assets.names, embedding, seen, camera)
+    clip = fit_landmarks(assets, embedding, seen, camera)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the viewer does
-    live = FrameFit(assets, assets.names, embedding, clip, camera, size)
+    live = FrameFit(assets, embedding, clip, camera, size)
     begin = time.perf_counter()
     motions = [live.next(face, n / fps) for n, face in enumerate(faces)]
     each = 1000 * (time.perf_counter() - begin) / len(faces)

@@ -24,7 +24,12 @@ ORDER = [
     *("avatar.pipeline", "avatar.report", "avatar.view", "avatar.export", "avatar.sweep"),
     *("avatar.demo", "avatar.bench", "avatar.commands", "avatar.cli", "avatar"),
 ]
-ON_TOP = {"avatar.pipeline", "avatar.bench", "avatar.commands"}  # what may use the importers of data_prep
+ON_TOP = {
+    "avatar.pipeline",
+    "avatar.view",
+    "avatar.bench",
+    "avatar.commands",
+}  # what may use the importers of data_prep
 BELOW = {"types", "errors", "version", "tensors", "compute", "head", "data", "files", "html"}  # what importers may use
 
 

@@ -8,6 +8,8 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+import torch
+
 Name = TypeVar("Name", bound=Hashable)
 
 
@@ -41,6 +43,12 @@ def paired_medians(
             if turn >= 0:
                 spans[name].append(span)
     return {name: time_of(values) for name, values in spans.items()}
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until a GPU has done all that was launched."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 def time_of(milliseconds: Sequence[float]) -> Time:

@@ -18,10 +18,9 @@ from typing import Any
 import torch
 
 from avatar.bench import Request
-from avatar.bench.clock import Time, paired_medians
+from avatar.bench.clock import Time, paired_medians, synchronize
 from avatar.bench.machine import limited_to
 from avatar.bench.results import write_report
-from avatar.bench.splat_gpu import synchronize
 from avatar.bench.stages import Stopwatch
 from avatar.compute.device import on_gpu, to_device
 from avatar.errors import UserError

@@ -13,9 +13,9 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from avatar.bench.clock import Time, paired_medians
+from avatar.bench.clock import Time, paired_medians, synchronize
 from avatar.bench.machine import available_simd, limited_to
-from avatar.bench.splat_gpu import device_of, synchronize
+from avatar.compute.device import CPU, interpreted
 from avatar.errors import UserError
 from avatar.splat import splat
 from avatar.splat.scenes import HEAD_SPLATS, head_camera, head_shell
@@ -230,6 +230,11 @@ def passes_of(variant: Variant, gaussians: Gaussians, size: int) -> dict[str, Ca
             return gradients
 
     return {"forward": forward, "backward": backward}
+
+
+def device_of(backend: str) -> torch.device:
+    """Where a backend draws."""
+    return torch.device("cuda") if backend == "gpu" and not interpreted() else CPU
 
 
 def leaves_of(variant: Variant, gaussians: Gaussians) -> Gaussians:

@@ -174,7 +174,7 @@ def measure(filmed: Filmed, config: Config, scratch: Path) -> Result:
 def tracked_by_landmarks(tracked: Path, head: Path, own: Recording, assets: HeadAssets) -> Recording:
     """The fit to the stored landmarks of a tracked folder alone, without its pictures."""
     seen = load_landmarks(tracked / LANDMARKS_FILE)
-    fit = fit_landmarks(assets, assets.names, find_embedding(head, assets), seen, Pinhole(*own.intrinsics))
+    fit = fit_landmarks(assets, find_embedding(head, assets), seen, Pinhole(*own.intrinsics))
     rows = as_tracks(fit, fit.motion, own.intrinsics, seen.size, assets.num_expressions)
     tracks = {
         name: torch.from_numpy(np.stack([getattr(rows[int(number)], name) for number in own.names])).float()

@@ -10,10 +10,9 @@ from itertools import cycle
 import torch
 
 from avatar.bench import Request
-from avatar.bench.clock import Time, paired_medians
+from avatar.bench.clock import Time, paired_medians, synchronize
 from avatar.bench.results import write_report
 from avatar.bench.roofline import roofline_ms
-from avatar.bench.splat_gpu import synchronize
 from avatar.bench.stages import Stopwatch
 from avatar.compute.cuda_graph import own_stream
 from avatar.compute.device import on_gpu

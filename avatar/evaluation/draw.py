@@ -14,7 +14,7 @@ from avatar.data.colours import Colour
 from avatar.data.frame import Frame
 from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import ImageFormat
-from avatar.files.video import ERROR_SCALE, error_map, padded, side_by_side
+from avatar.files.video import ERROR_SCALE, error_map, grid, side_by_side
 from avatar.render import Renderer
 from avatar.splat import checked_drawings
 
@@ -49,11 +49,7 @@ def panel(
 
 def contact_sheet(panels: Sequence[UInt8[np.ndarray, "H W 3"]]) -> bytes:
     """Panels in two columns, row by row, as a PNG file."""
-    height, width = (max(panel.shape[axis] for panel in panels) for axis in (0, 1))
-    filled = [padded(panel, height, width) for panel in panels]
-    filled += [np.full_like(filled[0], 255)] * (-len(panels) % SHEET_COLUMNS)
-    rows = [np.concatenate(filled[i : i + SHEET_COLUMNS], axis=1) for i in range(0, len(filled), SHEET_COLUMNS)]
-    sheet = np.concatenate(rows)
+    sheet = grid(panels, SHEET_COLUMNS)
     if sheet.shape[1] > SHEET_WIDTH:
         height = round(sheet.shape[0] * SHEET_WIDTH / sheet.shape[1])
         sheet = cv2.resize(sheet, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)

@@ -179,6 +179,14 @@ def padded(panel: UInt8[np.ndarray, "h w 3"], height: int, width: int) -> UInt8[
     return np.pad(panel, ((0, rows), (0, columns), (0, 0)), constant_values=255)
 
 
+def grid(pictures: Sequence[UInt8[np.ndarray, "_ _ 3"]], columns: int) -> UInt8[np.ndarray, "H_grid W_grid 3"]:
+    """Pictures row by row over white, each with the room of the largest."""
+    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
+    filled = [padded(picture, height, width) for picture in pictures]
+    filled += [np.full_like(filled[0], 255)] * (-len(pictures) % columns)
+    return np.concatenate([np.concatenate(filled[i : i + columns], axis=1) for i in range(0, len(filled), columns)])
+
+
 def error_map(image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
     """Mean absolute error of the channels as a heat map: black at 0, light yellow from `ERROR_SCALE` up."""
     error = (image - target).abs().mean(dim=-1) / ERROR_SCALE

@@ -136,9 +136,9 @@ class ViewRenderer:
 
 
 def _draw_mesh(picture: np.ndarray, vertices: Float[Tensor, "V 3"], faces: Tensor, camera: Camera) -> None:
-    """The edges of the faces that are seen, into the picture."""
+    """The edges of the faces that are seen, into the picture; OpenCV counts the centres of pixels as whole numbers."""
     screen = camera.project(vertices).numpy()
     corners = faces.numpy()
     seen = np.unique(rasterize_mesh(screen, corners, camera.height, camera.width).face_id)
-    outlines = np.round(screen[corners[seen[seen >= 0]], :2] * 16).astype(np.int32)
+    outlines = np.round((screen[corners[seen[seen >= 0]], :2] - 0.5) * 16).astype(np.int32)
     cv2.polylines(picture, list(outlines), True, LINES, 1, cv2.LINE_AA, shift=4)

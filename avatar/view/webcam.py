@@ -1,15 +1,14 @@
 """`--webcam`: a person's face in pictures that come now, as the avatar's.
 
-The tracker is given: it says what face is in the newest picture. Here its motion becomes the avatar's, relative to both
-neutral faces, and so does the movement of its head.
+`LiveFaceTracker` says what face is in the newest picture. Here its motion becomes the avatar's, relative to both neutral
+faces, and so does the movement of its head.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
 
 from jaxtyping import Float
 from torch import Tensor
@@ -20,56 +19,10 @@ from avatar.motion.controls import joint_ranges
 from avatar.motion.neutral_pose import RestPose, find_neutral
 from avatar.motion.transfer import retargeted
 from avatar.runs.trained_avatar import TrainedAvatar
-from avatar.types import Camera, HeadParams
+from avatar.types import Camera
 from avatar.view.live import LiveFrame
 from avatar.view.player import WEBCAM
-
-NO_FACE = "There is no face in the picture."
-
-
-class Face(Protocol):
-    """A face in one picture."""
-
-    @property
-    def params(self) -> HeadParams: ...
-    @property
-    def R_cam_head(self) -> Float[Tensor, "3 3"]: ...
-    @property
-    def t_cam_head(self) -> Float[Tensor, 3]: ...
-    @property
-    def taken(self) -> float:
-        """Seconds of `time.monotonic`."""
-        ...
-
-
-class Calibration(Protocol):
-    @property
-    def identity(self) -> Float[Tensor, " S"]: ...
-    @property
-    def faces(self) -> Sequence[Face]: ...
-
-
-class Tracker(Protocol):
-    """Every call may wait for pictures, and raises UserError when no more will come."""
-
-    @property
-    def milliseconds(self) -> Mapping[str, float]:
-        """What the last picture took, by part."""
-        ...
-
-    def calibrate(self, say: Callable[[str], object]) -> Calibration:
-        """Who it is; `say` hears what the person should do."""
-        ...
-
-    def follow(self) -> Face | None:
-        """The face in the newest picture; None where there is none."""
-        ...
-
-    def dropped(self) -> tuple[int, int]:
-        """How many pictures a newer one overtook, and how many there were."""
-        ...
-
-    def close(self) -> None: ...
+from data_prep.live.face_tracker import NO_FACE, Calibration, LiveFaceTracker, TrackedFace
 
 
 class Webcam:
@@ -77,7 +30,7 @@ class Webcam:
 
     name = WEBCAM
 
-    def __init__(self, trained: TrainedAvatar, tracker: Tracker, say: Callable[[str], object] = print) -> None:
+    def __init__(self, trained: TrainedAvatar, tracker: LiveFaceTracker, say: Callable[[str], object] = print) -> None:
         """`say` hears, once each, what happens; `status` says it too."""
         self._trained, self._tracker, self._say = trained, tracker, say
         self._goal = RestPose(trained.neutral.expression, trained.neutral.jaw, None)
@@ -86,9 +39,9 @@ class Webcam:
         self._has_torso = not {"lean", "turn"}.isdisjoint(joint_ranges(recording.motion(recording.split.train)))
         self._lock = threading.Lock()
         self._newest: LiveFrame | None = None
-        self._face: Face | None = None
+        self._face: TrackedFace | None = None
         self._rest: RestPose | None = None
-        self._rest_face: Face | None = None
+        self._rest_face: TrackedFace | None = None
         self._words, self._is_open = "Waiting for the first picture.", True
         self._on_frame: Callable[[], object] = lambda: None
         self._thread = threading.Thread(target=self._run, daemon=True, name="webcam")
@@ -147,7 +100,7 @@ class Webcam:
         rest = find_neutral([face.params for face in calibration.faces], head)
         self._rest, self._rest_face = rest, calibration.faces[rest.frame or 0]
 
-    def _take(self, face: Face | None) -> None:
+    def _take(self, face: TrackedFace | None) -> None:
         if face is None:
             self._words = NO_FACE
             return
@@ -164,7 +117,7 @@ class Webcam:
         self._on_frame()
 
 
-def moved_camera(own: Camera, rest: Face, face: Face) -> Camera:
+def moved_camera(own: Camera, rest: TrackedFace, face: TrackedFace) -> Camera:
     """`own` with the head turned and moved as from `rest` to `face`; its depth scales the movement, not the lens."""
     turn = face.R_cam_head @ rest.R_cam_head.T
     scale = own.t_cam_world[2] / rest.t_cam_head[2]

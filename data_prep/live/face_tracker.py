@@ -29,6 +29,7 @@ from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
 
 CALIBRATION_SECONDS = 4.0
 FEWEST, MOST = 20, 60  # pictures with the face that calibration is made from
+NO_FACE = "There is no face in the picture."
 _NO_FACES = np.zeros((0, 478, 3), np.float32)
 _SAME_PERSON = 0.1  # overlap (IoU) with the last place of the face
 
@@ -167,13 +168,10 @@ class LiveFaceTracker:
         equivalent = self.pictures.source.equivalent_focal
         focal = choose_focal(*size, points, field_of_view=self._field_of_view, equivalent=equivalent).pixels
         camera = Pinhole(focal, focal, size[0] / 2, size[1] / 2)
-        fit = fit_landmarks(self._assets, self._assets.names, self._embedding, landmarks, camera)
-        self._fit = FrameFit(self._assets, self._assets.names, self._embedding, fit, camera, size)
+        fit = fit_landmarks(self._assets, self._embedding, landmarks, camera)
+        self._fit = FrameFit(self._assets, self._embedding, fit, camera, size)
         self._expressions = fit.expressions
         return Calibration(_identity(fit), _as_faces(fit.motion, times, fit.expressions, self._assets))
-
-
-NO_FACE = "There is no face in the picture."
 
 
 def _identity(fit: LandmarkFit) -> Float[Tensor, " S"]:

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
-from avatar.head.expression_names import ExpressionNames
 from data_prep.track.faces.detect import Face
 from data_prep.track.faces.embedding import LandmarkEmbedding
 from data_prep.track.faces.landmarks import Landmarks
@@ -55,14 +54,13 @@ class FrameFit:
     def __init__(
         self,
         assets: HeadAssets,
-        names: ExpressionNames,
         embedding: LandmarkEmbedding,
         fit: LandmarkFit,
         camera: Pinhole,
         size: tuple[int, int],
     ) -> None:
         self._assets, self._fit, self._camera, self._size = assets, fit, camera, size
-        self._targets = score_targets(names, fit.expressions)
+        self._targets = score_targets(assets.names, fit.expressions)
         self._priors = both_ways(fit.priors, self._targets)  # the calibration's faces were calm
         _, self._weights = weighted_landmarks(assets, embedding)
         self._rigid = is_rigid(fit.term.landmarks)

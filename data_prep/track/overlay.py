@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from avatar.files.video import SHARP, video_writer
+from avatar.files.video import SHARP, grid, video_writer
 from avatar.head.model import HeadModel
 from data_prep.check.overlay import MASK, MOUTH, draw_mesh, outline
 from data_prep.formats.frame_track import FrameTrack
@@ -57,13 +57,6 @@ def write_overlay(
             add(canvas)
             if number in shown:
                 pictures.append(canvas)
-    write_image(folder / OVERLAY_SHEET, cv2.cvtColor(_sheet(pictures), cv2.COLOR_RGB2BGR), JPEG)
-
-
-def _sheet(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    blank = np.full_like(pictures[0], 255)
-    rows = []
-    for start in range(0, len(pictures), _COLUMNS):
-        row = list(pictures[start : start + _COLUMNS])
-        rows.append(np.concatenate(row + [blank] * (min(_COLUMNS, len(pictures)) - len(row)), axis=1))
-    return np.concatenate(rows)
+    write_image(
+        folder / OVERLAY_SHEET, cv2.cvtColor(grid(pictures, min(_COLUMNS, len(pictures))), cv2.COLOR_RGB2BGR), JPEG
+    )

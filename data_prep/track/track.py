@@ -33,6 +33,7 @@ from data_prep.formats.avatar_track import (
 )
 from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress, silent
+from data_prep.track.faces.detect import FaceDetector
 from data_prep.track.faces.landmarks import load_landmarks, save_landmarks
 from data_prep.track.first_pass import FirstPass, from_json, look_at, to_json
 from data_prep.track.fit.focal import Focal
@@ -47,7 +48,7 @@ from data_prep.track.mattes.user_mattes import OwnMattes, open_mattes, refuse_ma
 from data_prep.track.quality import grade_tracking
 from data_prep.track.stage_folder import StageFolder, growing
 from data_prep.track.tracking_stages import DESPILLED, Choices, TrackingStages
-from data_prep.track.upright import find_upright_by_landmarks, sample_pictures
+from data_prep.track.upright import find_upright, sample_pictures
 
 SPILL = (
     "the background's colours reach {} pixels into the person's outline, as compression blurs them; they are taken out"
@@ -78,9 +79,7 @@ def track(
     choices = choices or Choices()
     footage = video if isinstance(video, Footage) else open_footage(video)
     say(f"{footage.path}: {footage.width}x{footage.height} pixels" + _rate_and_length(footage))
-    for note in footage.notes:
-        say(f"note: {note}")
-    for note in head.notes:
+    for note in (*footage.notes, *head.notes):
         say(f"note: {note}")
     check_span(choices.span, footage.duration)
     network, options, seen = matte_network(), choices.to_json(), look_inputs(footage)
@@ -176,7 +175,8 @@ def _look(
         turn = choices.rotate
         if turn is None or mattes is not None:
             pictures = [picture.image for picture in sample_pictures(footage, choices.span)]
-            turn, faces = find_upright_by_landmarks(pictures, choices.rotate)
+            with FaceDetector() as detector:
+                turn, faces = find_upright(pictures, detector.anywhere, choices.rotate)
             if mattes is not None:
                 refuse_mattes_of_others(mattes.turned(turn), choices.span, faces)
         look = look_at(turned(footage, turn), choices.span, progress)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from avatar.errors import UserError
-from data_prep.track.faces.detect import Face, FaceDetector
+from data_prep.track.faces.detect import Face
 from data_prep.track.footage.rotated import TURNS, turn_image
 from data_prep.track.footage.source import Footage, Span, TimedPicture, View, whole
 
@@ -76,11 +76,6 @@ def find_upright(pictures: list[UInt8[np.ndarray, "H W 3"]], find: FindFace, giv
     best = max(votes, key=votes.__getitem__)
     turn = best if votes[best] >= max(_FEWEST, _SURE * votes[0]) else 0
     return Upright(turn, found[turn])
-
-
-def find_upright_by_landmarks(pictures: list[UInt8[np.ndarray, "H W 3"]], given: int | None) -> Upright:
-    with FaceDetector() as detector:
-        return find_upright(pictures, detector.anywhere, given)
 
 
 def roll_of(face: Face) -> float:

@@ -15,9 +15,10 @@ from avatar.motion.orbit import orbited
 from avatar.runs.motion_clip import own_clip
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.tensors import to_8_bit
+from avatar.types import Camera
 from avatar.view.live import LiveFrame
 from avatar.view.player import NEUTRAL, STREAM, Player
-from avatar.view.view_renderer import MARGIN, Setting, ViewOffset, ViewRenderer
+from avatar.view.view_renderer import MARGIN, Setting, ViewOffset, ViewRenderer, _draw_mesh
 
 WIDTH = 64
 
@@ -39,6 +40,15 @@ def test_a_frame_is_drawn_as_the_program_draws_it(renderer: ViewRenderer, traine
     expected = trained.render(params, orbited(camera.resized(WIDTH, WIDTH), look.yaw, look.pitch, look.zoom)).image
     np.testing.assert_array_equal(drawn, to_8_bit(expected).numpy())
     assert not np.array_equal(drawn, renderer.draw((params, camera), Setting(), WIDTH))
+
+
+def test_the_mesh_lies_on_the_pixels_that_it_is_projected_to() -> None:
+    vertices = torch.tensor([[2.5, 4.5, 1.0], [12.5, 4.5, 1.0], [7.5, 12.5, 1.0]])
+    camera = Camera(torch.eye(3), torch.zeros(3), 1.0, 1.0, 0.0, 0.0, 16, 16)  # pixels for metres
+    picture = np.zeros((16, 16, 3), np.uint8)
+    _draw_mesh(picture, vertices, torch.tensor([[0, 1, 2]]), camera)
+    above, on, below = picture[3:6, 7, 1].tolist()
+    assert abs(above - below) < 10 and on > 2 * max(above, below), "an edge through the centres of a row"
 
 
 def test_controls_add_and_joints_replace(renderer: ViewRenderer, trained: TrainedAvatar) -> None:

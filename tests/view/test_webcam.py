@@ -20,7 +20,8 @@ from avatar.runs.trained_avatar import TrainedAvatar, load_avatar
 from avatar.types import HeadParams
 from avatar.view.live import LiveFrame, LiveTiming
 from avatar.view.player import WEBCAM, Player
-from avatar.view.webcam import NO_FACE, Webcam, moved_camera
+from avatar.view.webcam import Webcam, moved_camera
+from data_prep.live.face_tracker import NO_FACE
 
 
 @dataclass(frozen=True)

@@ -35,15 +35,13 @@ _ITERATIONS = 20
 def rendered_embedding(
     assets: HeadAssets, landmarker: Landmarker, say: Callable[[str], object] = lambda _: None
 ) -> LandmarkEmbedding:
-    """The 468 landmarks of the face mesh on `assets`, from the cache where it was made before.
+    """The 468 landmarks of the face mesh on `assets`, made now and kept for `cached_embedding`.
 
     Raises UserError when the landmarker finds no faces in the pictures of the head model.
     """
-    found = cached_embedding(assets)
-    if found is None:
-        say("looking for the landmarks on the head model (once for each head model)")
-        found = make_embedding(assets, landmarker)
-        save_embedding(_place(assets), found)
+    say("looking for the landmarks on the head model (once for each head model)")
+    found = make_embedding(assets, landmarker)
+    save_embedding(_place(assets), found)
     return found
 
 
@@ -57,18 +55,18 @@ def _place(assets: HeadAssets) -> Path:
     return cache_folder() / "embeddings" / name
 
 
-def make_embedding(assets: HeadAssets, landmarker: Landmarker, heads: int = HEADS) -> LandmarkEmbedding:
+def make_embedding(assets: HeadAssets, landmarker: Landmarker) -> LandmarkEmbedding:
     """The embedding as `rendered_embedding` gives it, made now."""
     screens, seen, landmarks = [], [], []
-    for head in render_tinted_heads(assets, heads):
+    for head in render_tinted_heads(assets, HEADS):
         points = landmarker(head.image)
         if points is not None:
             screens.append(head.screen[:, :2].astype(np.float32))
             seen.append(head.is_visible)
             landmarks.append(points[:NUM_MESH, :2])
-    if len(landmarks) < min(FEWEST, heads):
+    if len(landmarks) < FEWEST:
         raise UserError(
-            f"the landmarker found a face in {len(landmarks)} of {heads} pictures of the head model; put FLAME's "
+            f"the landmarker found a face in {len(landmarks)} of {HEADS} pictures of the head model; put FLAME's "
             "mediapipe_landmark_embedding.npz beside it, or use another head model"
         )
     return locate(assets, np.stack(screens), np.stack(seen), np.stack(landmarks))

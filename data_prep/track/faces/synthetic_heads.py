@@ -38,9 +38,9 @@ class TintedHead(NamedTuple):
     is_visible: np.ndarray  # bool [V]
 
 
-def render_tinted_heads(assets: HeadAssets, count: int, seed: int = 0) -> Iterator[TintedHead]:
-    """`count` random identities with random expressions, poses, skin and light; the same ones for the same seed."""
-    rng = np.random.default_rng(seed)
+def render_tinted_heads(assets: HeadAssets, count: int) -> Iterator[TintedHead]:
+    """`count` random identities with random expressions, poses, skin and light; always the same ones."""
+    rng = np.random.default_rng(0)
     faces = assets.faces.numpy()
     paint = _Paint(assets)
     used = used_expressions(assets).numpy()

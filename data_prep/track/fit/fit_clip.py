@@ -34,7 +34,7 @@ def fit_tracks(
     embedding = find_embedding(head_path, head)
     camera = Pinhole(*clip.intrinsics)
     with side_by_side():
-        by_landmarks = fit_landmarks(head, head.names, embedding, clip.landmarks, camera)
+        by_landmarks = fit_landmarks(head, embedding, clip.landmarks, camera)
         by_pictures = fit_pictures(head, by_landmarks, camera, clip.images, clip.mattes, progress)
 
     def judged(motion: Motion) -> tuple[dict[int, FrameTrack], dict[str, Any]]:

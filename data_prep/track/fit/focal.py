@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from avatar.errors import UserError
+from data_prep.track.faces.landmark_groups import LEFT_IRIS, RIGHT_IRIS
 
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # millimetres; "equivalent" focal lengths compare diagonals (CIPA DCG-001)
 ASSUMED_EQUIVALENT = 28.0  # millimetres: telephones and webcams have 23 to 32
 PUPIL_DISTANCE = 0.063  # metres, of adults
 NEAREST = 0.6  # metres: a face that seems nearer than an arm is long is a part of a larger picture,
 CROPPED = 0.9  # and was filmed from 0.6 to 1.5 metres away, or farther
-_LEFT_IRIS, _RIGHT_IRIS = 473, 468
 
 
 class Focal(NamedTuple):
@@ -54,7 +54,7 @@ def choose_focal(
     words = f"assumed: a lens of {ASSUMED_EQUIVALENT:g} mm equivalent"
     if len(points):
         # Turned heads show their eyes closer together; the widest tenth is seen from the front.
-        eyes = np.linalg.norm(points[:, _LEFT_IRIS, :2] - points[:, _RIGHT_IRIS, :2], axis=1)
+        eyes = np.linalg.norm(points[:, LEFT_IRIS, :2] - points[:, RIGHT_IRIS, :2], axis=1)
         per_metre = float(np.percentile(eyes, 90)) / PUPIL_DISTANCE  # pixels of focal length, for a metre of distance
         if NEAREST * per_metre > pixels:
             pixels, words = CROPPED * per_metre, f"assumed: the face is {CROPPED:g} m away"

@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from avatar.head.assets import HeadAssets
-from avatar.head.expression_names import ExpressionNames
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from data_prep.track.faces import landmark_groups as groups
 from data_prep.track.faces.embedding import LandmarkEmbedding, as_points, iris_embedding
@@ -30,7 +29,6 @@ from data_prep.track.fit.smoothness import Smoothness, make_smoothness
 from data_prep.track.fit.surface import SurfacePoints
 
 POINT_SHARE = 0.02  # of the distance between the eyes: the landmarks' standard deviation
-ROBUST, ROBUST_PAIRS = 4.0, 3.0  # scale of the loss, in those deviations
 FEATURE_WEIGHTS = {groups.LIPS: 1.3, groups.LIDS: 1.3, groups.BROWS: 0.6, groups.NOSE: 1.0}
 OTHER_WEIGHT = 0.12  # of landmarks between the features
 OTHER_DISTANCE = 0.16  # in distances between the eyes: nearer than that to lips, lids or brows they are biased
@@ -56,7 +54,7 @@ class LandmarkFit:
 
 
 def fit_landmarks(
-    assets: HeadAssets, names: ExpressionNames, embedding: LandmarkEmbedding, landmarks: Landmarks, camera: Pinhole
+    assets: HeadAssets, embedding: LandmarkEmbedding, landmarks: Landmarks, camera: Pinhole
 ) -> LandmarkFit:
     frames = np.flatnonzero(landmarks.detected)
     seen = Landmarks(
@@ -66,12 +64,12 @@ def fit_landmarks(
     identities = min(IDENTITIES, _last_used(assets.shape_dirs) + 1)
     term = make_landmark_term(assets, embedding, seen, camera, identities, expressions)
     R, t = _start(assets, embedding, seen, camera)
-    term = _with_unit(term, assets, camera, t)
-    priors = make_priors(seen, names, expressions, statistical)
+    term = replace(term, unit=point_units(assets, camera, t))
+    priors = make_priors(seen, assets.names, expressions, statistical)
     smoothness = make_smoothness(assets, torch.from_numpy(frames), landmarks.fps, len(expressions), statistical)
-    motion = at_rest(R, t, len(expressions)).moved(
-        torch.cat((torch.zeros(len(R), 6, dtype=torch.float64), _plausible(priors)), dim=1)
-    )
+    plausible = priors.mean.clamp(priors.low, priors.high)
+    step = torch.cat((torch.zeros(len(R), 6, dtype=torch.float64), plausible), dim=1)
+    motion = at_rest(R, t, len(expressions)).moved(step)
     identity = torch.zeros(identities, dtype=torch.float64)
     key = torch.from_numpy(np.unique(np.linspace(0, len(frames) - 1, min(KEY_FRAMES, len(frames))).round().astype(int)))
     first = minimise(
@@ -108,8 +106,6 @@ def make_landmark_term(
         unit=torch.ones(T, dtype=torch.float64),
         pairs=torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2),
         pair_weights=torch.full((T, len(pairs)), PAIR_WEIGHT, dtype=torch.float64),
-        scale=ROBUST,
-        pair_scale=ROBUST_PAIRS,
     )
 
 
@@ -163,17 +159,9 @@ def is_rigid(landmarks: Int[np.ndarray, " L"]) -> Bool[np.ndarray, " L"]:
     return np.isin(landmarks, groups.FEATURES) & ~np.isin(landmarks, groups.LIPS)
 
 
-def _with_unit(term: LandmarkTerm, assets: HeadAssets, camera: Pinhole, t: Tensor) -> LandmarkTerm:
-    return replace(term, unit=point_units(assets, camera, t))
-
-
 def point_units(assets: HeadAssets, camera: Pinhole, t: Float[Tensor, "T 3"]) -> Float[Tensor, " T"]:
     """The landmarks' standard deviation in pixels, of heads at these places."""
     return POINT_SHARE * eye_distance(assets) * camera.fx / t[:, 2]
-
-
-def _plausible(priors: Priors) -> Float[Tensor, "T C"]:
-    return priors.mean.clamp(priors.low, priors.high)
 
 
 def _last_used(directions: Tensor) -> int:

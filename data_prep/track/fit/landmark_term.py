@@ -15,6 +15,7 @@ from data_prep.track.fit.frame_poses import Motion
 from data_prep.track.fit.normal_equations import NormalEquations
 from data_prep.track.fit.surface import SurfacePoints
 
+ROBUST, ROBUST_PAIRS = 4.0, 3.0  # scale of the loss, in units
 _FRAMES_AT_ONCE = 32
 
 
@@ -33,8 +34,6 @@ class LandmarkTerm:
     unit: Float[Tensor, " T"]  # pixels that one residual stands for: the points' standard deviation
     pairs: Int[Tensor, "P 2"]  # rows of the points
     pair_weights: Float[Tensor, "T P"]
-    scale: float  # c of the points, in units
-    pair_scale: float
 
     def take(self, frames: slice | Tensor) -> LandmarkTerm:
         """The same term of some frames."""
@@ -99,5 +98,5 @@ class LandmarkTerm:
         off = (projected - self.observed) / self.unit[:, None, None]
         residuals = torch.cat((off, off[:, self.pairs[:, 0]] - off[:, self.pairs[:, 1]]), dim=1)
         L, P = off.shape[1], len(self.pairs)
-        scales = torch.cat((off.new_full((L,), self.scale), off.new_full((P,), self.pair_scale)))
+        scales = torch.cat((off.new_full((L,), ROBUST), off.new_full((P,), ROBUST_PAIRS)))
         return residuals, torch.cat((self.weights, self.pair_weights), dim=1), scales

@@ -42,16 +42,16 @@ def skin_triangles(assets: HeadAssets) -> Int[np.ndarray, "F 3"]:
 
 
 def spread_points(
-    assets: HeadAssets, triangles: Int[np.ndarray, "F 3"], count: int = COUNT, seed: int = 0
+    assets: HeadAssets, triangles: Int[np.ndarray, "F 3"]
 ) -> tuple[Int[Tensor, "N 3"], Float[Tensor, "N 3"]]:
-    """Points spread evenly over the triangles of the template: corners and barycentric weights."""
+    """`COUNT` points spread evenly over the triangles of the template: corners and barycentric weights."""
     corners = assets.template.numpy()[triangles].astype(np.float64)
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     # One point in each equal share of the area, at random within its triangle.
-    at = (np.arange(count) + 0.5) / count * area.sum()
+    at = (np.arange(COUNT) + 0.5) / COUNT * area.sum()
     chosen = triangles[np.searchsorted(np.cumsum(area), at).clip(0, len(triangles) - 1)]
-    u, v = np.sqrt(rng.random(count)), rng.random(count)
+    u, v = np.sqrt(rng.random(COUNT)), rng.random(COUNT)
     weights = np.stack((1 - u, u * (1 - v), u * v), axis=-1)
     return torch.from_numpy(chosen), torch.from_numpy(weights)
 

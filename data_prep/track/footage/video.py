@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from avatar.errors import UserError
 from avatar.files.read import open_file
+from avatar.files.third_party import sha256_of
 from data_prep.ffmpeg import Decoder, Shown, describe, first_picture, rate_of
 from data_prep.track.footage.source import (
     LAID_OVER_GREY,
@@ -110,11 +110,7 @@ class Video(Footage):
 
     @cached_property
     def content_hash(self) -> str:
-        try:
-            with open_file(self.path, None) as file:
-                return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
-        except OSError as error:
-            raise UserError(f"{self.path} cannot be read ({error.strerror})") from None
+        return sha256_of(self.path)
 
 
 def _report_damage(decoder: Decoder, count: int, complain: Callable[[str], object]) -> None:

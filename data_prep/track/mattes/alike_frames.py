@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Shaped, UInt8
 
 from data_prep.track.mattes.background_plate import dilated
 
@@ -50,21 +50,22 @@ def person_alone(
     away = [float(np.sqrt(np.square(one.points - frame.points).sum(axis=1).mean())) for one in others]
     alike = np.argsort(away, kind="stable")[:ALIKE]
     height, width = frame.matte.shape
-    laid = [
-        cv2.warpAffine(
-            others[i].matte,
-            similarity(others[i].points, frame.points),
-            (width, height),
-            flags=cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        for i in alike
-    ]
+    laid = [laid_over(others[i].matte, others[i].points, frame.points) for i in alike]
     agreed = np.median(laid, axis=0).astype(np.uint8)
     reach = round(_MARGIN * max(height, width) + float(np.median(np.array(away)[alike])))
     kept = dilated(agreed > _HALF, reach) | dilated(frame.matte > _SURE, _EDGE)
     most = np.where(kept, 255, agreed).astype(np.uint8)
     return np.minimum(matte, cv2.resize(most, matte.shape[::-1], interpolation=cv2.INTER_LINEAR))
+
+
+def laid_over(
+    matte: Shaped[np.ndarray, "h w"], source: Float[np.ndarray, "L 2"], target: Float[np.ndarray, "L 2"]
+) -> Shaped[np.ndarray, "h w"]:
+    """A matte by the similarity that brings points of it nearest to those of another of its size."""
+    size = matte.shape[1], matte.shape[0]
+    return cv2.warpAffine(
+        matte, similarity(source, target), size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
 
 
 def similarity(source: Float[np.ndarray, "L 2"], target: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "2 3"]:

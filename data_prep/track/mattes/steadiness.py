@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from data_prep.track.mattes.alike_frames import laid_over
+
 _FRAMES = 100  # that are looked at, at most, spread over the clip
 _SIDE = 512  # pixels of the longer side, in which distances are given
 _BESIDE, _ABOVE = 0.5, 0.5  # of the height of the mesh without its neck, beyond it: what is looked at
@@ -37,9 +39,7 @@ def measure_outline(
     jitter, width = [], []
     for number in middles[:: -(-len(middles) // _FRAMES) or 1]:
         now, at = _share(matte_of(number)), points_of(number)
-        moved = [
-            _warped(_share(matte_of(beside)), _similarity(points_of(beside), at)) for beside in (number - 1, number + 1)
-        ]
+        moved = [laid_over(_share(matte_of(n)), points_of(n), at) for n in (number - 1, number + 1)]
         region = _about_head(at, *now.shape)
         slope = np.hypot(*np.gradient(cv2.GaussianBlur(now, (0, 0), 1.0)))
         length = max(float(slope[region].sum()), 1.0)  # of the line where the matte is half
@@ -51,22 +51,6 @@ def measure_outline(
 
 def _share(matte: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
     return matte.astype(np.float32) / 255.0
-
-
-def _similarity(points: Float[np.ndarray, "P 2"], to: Float[np.ndarray, "P 2"]) -> Float[np.ndarray, "2 3"]:
-    """The least-squares rotation, scale and shift of `points` to `to`."""
-    z, w = points @ (1.0, 1.0j), to @ (1.0, 1.0j)
-    a = np.vdot(z - z.mean(), w - w.mean()) / max(np.vdot(z - z.mean(), z - z.mean()).real, 1e-9)
-    b = w.mean() - a * z.mean()
-    return np.array([[a.real, -a.imag, b.real], [a.imag, a.real, b.imag]])
-
-
-def _warped(matte: Float32[np.ndarray, "H W"], by: Float[np.ndarray, "2 3"]) -> Float32[np.ndarray, "H W"]:
-    """Pixel centres lie at +0.5 in points, at whole numbers for OpenCV."""
-    by = by.copy()
-    by[:, 2] += 0.5 * by[:, :2].sum(axis=1) - 0.5
-    size = matte.shape[1], matte.shape[0]
-    return cv2.warpAffine(matte, by, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _about_head(points: Float[np.ndarray, "P 2"], height: int, width: int) -> Bool[np.ndarray, "H W"]:

@@ -34,7 +34,7 @@ class Followed:
 
     def fitter(self) -> FrameFit:
         scene = self.scene
-        return FrameFit(scene.assets, scene.names, scene.embedding, self.calibration, scene.camera, (SIZE, SIZE))
+        return FrameFit(scene.assets, scene.embedding, self.calibration, scene.camera, (SIZE, SIZE))
 
     def follow(self, fit: FrameFit, frames: range, fps: float = FPS) -> Motion:
         motions = [fit.next(self.face(n), n / fps) for n in frames]
@@ -55,7 +55,7 @@ def followed(demo_head_model: Path) -> Followed:
     scene = spoken_scene(demo_head_model, FRAMES)
 
     def fit(frames: slice) -> LandmarkFit:
-        return fit_landmarks(scene.assets, scene.names, scene.embedding, part(scene.landmarks, frames), scene.camera)
+        return fit_landmarks(scene.assets, scene.embedding, part(scene.landmarks, frames), scene.camera)
 
     return Followed(scene, fit(slice(0, FRAMES)), fit(slice(0, CALIBRATED)))
 
@@ -102,7 +102,7 @@ def test_the_mouth_goes_to_the_side_that_the_calibration_has_not_seen(followed: 
     scores = scene.landmarks.scores.copy()
     scores[:, places] = 0.02, 0.005
     calm = part(replace(scene.landmarks, scores=scores), slice(0, CALIBRATED))
-    calibration = fit_landmarks(scene.assets, scene.names, scene.embedding, calm, scene.camera)
+    calibration = fit_landmarks(scene.assets, scene.embedding, calm, scene.camera)
     performance = perform(SEED, 40, "speech")
     head = HeadModel(scene.assets, torch.from_numpy(sample_identity(SEED).shape))
     params, camera = (frame_params(performance, 3), frame_camera(performance, 3, SIZE))

@@ -25,7 +25,7 @@ def with_marks(monkeypatch: pytest.MonkeyPatch) -> None:
         made = FrameTrack(**one, R=np.eye(3), intrinsics=np.array(clip.intrinsics), size=clip.landmarks.size)
         return Fit(dict.fromkeys(np.flatnonzero(clip.landmarks.detected).tolist(), made), {})
 
-    for module in ("upright", "first_pass"):
+    for module in ("track", "first_pass"):
         monkeypatch.setattr(f"data_prep.track.{module}.FaceDetector", MarkDetector)
     monkeypatch.setattr("data_prep.track.tracking_stages.fit_tracks", fitted)
     monkeypatch.setattr(tracking.TrackingStages, "masks", lambda *_: ([1.0], None))

@@ -14,7 +14,6 @@ from spoken_scene import DRIFT, NOISE, SIZE, Scene, drawn, spoken_scene
 
 from avatar.demo.render import RenderedFrame
 from avatar.errors import UserError
-from avatar.head.expression_names import load_expression_names
 from avatar.head.model import HeadModel
 from data_prep.prepare.projection import project_head
 from data_prep.progress import silent
@@ -44,7 +43,7 @@ class Fitted:
 @pytest.fixture(scope="module")
 def scene(demo_head_model: Path) -> Fitted:
     seen = spoken_scene(demo_head_model, FRAMES)
-    fit = fit_landmarks(seen.assets, seen.names, seen.embedding, seen.landmarks, seen.camera)
+    fit = fit_landmarks(seen.assets, seen.embedding, seen.landmarks, seen.camera)
     return Fitted(seen, drawn(FRAMES), fit)
 
 
@@ -60,11 +59,10 @@ def test_the_landmarks_are_met(scene: Fitted) -> None:
     assert float(scene.fit.identity.abs().max()) < 4.0
 
 
-def test_the_fit_repeats_to_the_bit(scene: Fitted, demo_head_model: Path) -> None:
-    names = load_expression_names(demo_head_model, scene.seen.assets.num_expressions)
+def test_the_fit_repeats_to_the_bit(scene: Fitted) -> None:
     seen = scene.seen.landmarks
     few = replace(seen, points=seen.points[:4], scores=seen.scores[:4], detected=seen.detected[:4])
-    fits = [fit_landmarks(scene.seen.assets, names, scene.seen.embedding, few, scene.seen.camera) for _ in range(2)]
+    fits = [fit_landmarks(scene.seen.assets, scene.seen.embedding, few, scene.seen.camera) for _ in range(2)]
     assert torch.equal(fits[0].motion.R, fits[1].motion.R) and torch.equal(fits[0].identity, fits[1].identity)
 
 

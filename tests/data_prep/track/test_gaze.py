@@ -39,7 +39,7 @@ def looked(demo_head_model: Path) -> Looked:
     for side, iris in enumerate(IRISES):
         points[TRUE.eyelids[:, side] > 0.5, iris, :2] += 0.15 * scene.eyes
     scene = replace(scene, landmarks=replace(scene.landmarks, points=points, scores=scores))
-    return scene, fit_landmarks(scene.assets, scene.names, scene.embedding, scene.landmarks, scene.camera)
+    return scene, fit_landmarks(scene.assets, scene.embedding, scene.landmarks, scene.camera)
 
 
 def off_irises(fit: LandmarkFit, motion: Motion) -> np.ndarray:
@@ -86,7 +86,7 @@ def test_eyes_that_disagree_are_not_forced_together(looked: Looked) -> None:
     points = scene.landmarks.points.copy()
     points[:, IRISES[0], 0] += 0.04 * scene.eyes
     cross = replace(scene.landmarks, points=points)
-    fit = fit_landmarks(scene.assets, scene.names, scene.embedding, cross, scene.camera)
+    fit = fit_landmarks(scene.assets, scene.embedding, cross, scene.camera)
     assert np.median(off_irises(fit, fit.motion)[IS_OPEN]) < 1.0
 
 

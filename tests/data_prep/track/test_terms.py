@@ -53,7 +53,7 @@ def landmark_term() -> LandmarkTerm:
     return LandmarkTerm(
         landmarks=np.arange(N), points=points, camera=CAMERA, observed=seen + noise(T, N, 2, seed=6, scale=3.0),
         weights=noise(T, N, seed=7).abs(), unit=noise(T, seed=8).abs() + 0.5, pairs=torch.tensor([[0, 1], [4, 2]]),
-        pair_weights=noise(T, 2, seed=9).abs(), scale=4.0, pair_scale=3.0,
+        pair_weights=noise(T, 2, seed=9).abs(),
     )  # fmt: skip
 
 

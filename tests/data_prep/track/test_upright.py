@@ -17,13 +17,13 @@ from avatar.commands.parser import build_parser
 from avatar.errors import UserError
 from data_prep.formats.avatar_track import read_info
 from data_prep.track import track as tracking
-from data_prep.track.faces.detect import Face
+from data_prep.track.faces.detect import Face, FaceDetector
 from data_prep.track.faces.landmarks import load_landmarks
 from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.rotated import TURNS, turn_image, turned
 from data_prep.track.footage.source import Box, Span, View, whole
 from data_prep.track.track import Choices, track
-from data_prep.track.upright import find_upright, find_upright_by_landmarks, roll_of, sample_pictures
+from data_prep.track.upright import find_upright, roll_of, sample_pictures
 
 FRAMES = 12
 
@@ -119,8 +119,10 @@ def test_samples_are_from_all_over_the_part_that_is_used(has_length: bool, tmp_p
 @pytest.mark.slow
 def test_real_landmarks_say_the_turn(tracking_models: None) -> None:
     pictures = talking(2, 160)
-    for turn in TURNS:
-        assert find_upright_by_landmarks([turn_image(image, -turn % 360) for image in pictures], None).turn == turn
+    with FaceDetector() as detector:
+        for turn in TURNS:
+            turned_pictures = [turn_image(image, -turn % 360) for image in pictures]
+            assert find_upright(turned_pictures, detector.anywhere).turn == turn
 
 
 def tracked(folder: Path, video: Path, **choices: Any) -> tuple[Path, list[str]]:
