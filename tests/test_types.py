@@ -1,4 +1,4 @@
-"""The training target of a frame."""
+"""The training target of a frame, and the condition of a head."""
 
 from __future__ import annotations
 
@@ -32,3 +32,11 @@ def test_the_target_is_exact_where_nothing_is_mixed() -> None:
     inside = (alpha * mask).bool()
     assert torch.equal(target[inside], image[inside])
     assert torch.equal(target[~inside], background.expand_as(target)[~inside])
+
+
+def test_another_condition_takes_the_place_of_all_but_the_neck() -> None:
+    zeros = HeadParams(torch.zeros(10), torch.zeros(6), torch.zeros(12), torch.zeros(2), torch.arange(6.0))
+    wanted = torch.arange(1.0, 31.0)
+    found = zeros.with_condition(wanted)
+    assert torch.equal(found.condition(), wanted) and torch.equal(found.neck, zeros.neck)
+    assert torch.equal(zeros.condition(), torch.zeros(30))

@@ -48,7 +48,7 @@ def split_frames(count: int, test_frames: int | None = None) -> Split:
     elif is_long:
         test = TEST_FRAMES
     else:
-        test = min(max(count - int(count * SHORT_CLIP_TRAIN_FRACTION), 1), count - 1)
+        test = count - int(count * SHORT_CLIP_TRAIN_FRACTION)
     if not 1 <= test < count:
         raise UserError(f"{test} test frames cannot be held out of {count}: choose from 1 to {count - 1}")
     available = count - test

@@ -40,16 +40,17 @@ def latent_grid(assets: HeadAssets, texels: UVTexels, points: Float[Tensor, "N 3
     for texel in (texels.row, texels.column):
         # In units of cells, with the first cell's centre at 0; outside the outermost centres the nearest one counts.
         position = ((texel.double() + 0.5) * cells / texels.side - 0.5).clamp(0, cells - 1)
-        low = position.floor().clamp(max=max(cells - 2, 0))
+        low = position.floor()
         sides.append((low.long(), position - low))
     (row, down), (column, right) = sides
     keys, weights = [], []
     for i, vertical in ((0, 1 - down), (1, down)):
         for j, horizontal in ((0, 1 - right), (1, right)):
-            keys.append((chart * cells + (row + i).clamp(max=cells - 1)) * cells + (column + j).clamp(max=cells - 1))
+            keys.append((chart * cells + row + i) * cells + column + j)
             weights.append(vertical * horizontal)
     key, weight = torch.stack(keys, dim=1), torch.stack(weights, dim=1)
-    # A corner of no weight must not bring a node into being: it stands for the Gaussian's heaviest one.
+    # A corner of no weight, which may lie beyond the map, must not bring a node into being: it stands for the Gaussian's
+    # heaviest one.
     heaviest = key.gather(1, weight.argmax(dim=1, keepdim=True))
     key = torch.where(weight > 0, key, heaviest)
     used, nodes = torch.unique(key, return_inverse=True)

@@ -159,6 +159,7 @@ def test_frames_without_a_figure_are_left_out_of_an_interval() -> None:
     values = np.array([1.0, np.nan, 1.0, np.inf, 1.0, np.nan])
     assert BlockBootstrap(6, 2).interval(values) == (1.0, 1.0)
     assert BlockBootstrap(6, 2).interval(np.array([1.0, *[np.nan] * 5])) is None
+    assert BlockBootstrap(6, 1).interval(np.array([1.0, *[np.nan] * 4, 3.0])) == (1.0, 3.0)
     assert RESAMPLES == 2000
 
 

@@ -42,8 +42,8 @@ def test_what_is_linear_over_the_map_is_kept_between_the_outermost_nodes() -> No
     at = torch.zeros(len(grid.places), 2)
     for corner, (i, j) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
         some = grid.interpolate.weights[:, corner] > 0
-        low_u = (u * cells - 0.5).clamp(0, cells - 1).floor().clamp(max=cells - 2)
-        low_v = (v * cells - 0.5).clamp(0, cells - 1).floor().clamp(max=cells - 2)
+        low_u = (u * cells - 0.5).clamp(0, cells - 1).floor()
+        low_v = (v * cells - 0.5).clamp(0, cells - 1).floor()
         centre = torch.stack((low_u + j + 0.5, low_v + i + 0.5), dim=-1) / cells
         at[grid.interpolate.cells[some, corner]] = centre[some].float()
     inside = (u > 0.5 / cells) & (u < 1 - 0.5 / cells) & (v > 0.5 / cells) & (v < 1 - 0.5 / cells)

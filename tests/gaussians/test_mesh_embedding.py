@@ -88,3 +88,8 @@ def test_initial_scales_are_the_rms_distance_to_three_neighbours() -> None:
 def test_coincident_and_single_points_have_a_positive_scale() -> None:
     assert bool((knn_scales(torch.zeros(5, 3)) > 0).all())
     assert bool((knn_scales(torch.zeros(1, 3)) > 0).all())
+
+
+def test_the_scale_of_two_points_is_their_distance() -> None:
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.03, 0.04]])
+    torch.testing.assert_close(knn_scales(points), torch.tensor([0.05, 0.05]))
