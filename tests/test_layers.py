@@ -24,12 +24,8 @@ ORDER = [
     *("avatar.pipeline", "avatar.report", "avatar.view", "avatar.export", "avatar.sweep"),
     *("avatar.demo", "avatar.bench", "avatar.commands", "avatar.cli", "avatar"),
 ]
-ON_TOP = {
-    "avatar.pipeline",
-    "avatar.view",
-    "avatar.bench",
-    "avatar.commands",
-}  # what may use the importers of data_prep
+# What may use the importers of data_prep.
+ON_TOP = {"avatar.pipeline", "avatar.view", "avatar.bench", "avatar.commands"}
 BELOW = {"types", "errors", "version", "tensors", "compute", "head", "data", "files", "html"}  # what importers may use
 
 

@@ -20,7 +20,7 @@ from avatar.bench import Request
 from avatar.bench.figures import Figures, head_figures
 from avatar.bench.perturb_tracking import COEFFICIENT_SHARE, SHIFT_MM, TURN_DEGREES, perturbed
 from avatar.bench.results import write_report
-from avatar.config import Config, load_config
+from avatar.config import Config, TrainerConfig, load_config
 from avatar.data.recording import Recording
 from avatar.data.source import Source
 from avatar.data.subject import Subject
@@ -30,7 +30,7 @@ from avatar.head.model import HeadModel
 from avatar.pipeline.refine_plan import round_steps
 from avatar.pose_refinement.refine_subject import refine_subject
 from avatar.runs.model_registry import make_avatar
-from avatar.train.frame_order import planned_steps, within_epochs
+from avatar.train.frame_order import within_epochs
 from avatar.train.loss import choose_perceptual
 from avatar.train.trainer import train
 from data_prep.prepare.open_subject import find_head, open_subject
@@ -157,3 +157,10 @@ def report(rows: Sequence[Row], config: Config) -> list[str]:
         "",
         f"{recovered(rows):.0%} of the PSNR lost by the disturbance came back",
     ]
+
+
+def planned_steps(config: TrainerConfig) -> str:
+    """How many steps that is, for a heading, before the number of frames is known."""
+    return f"{config.iterations} steps" + (
+        f", at most {config.max_epochs} epochs" if config.max_epochs is not None else ""
+    )

@@ -20,7 +20,7 @@ import torch
 
 from avatar.bench import Request
 from avatar.bench.figures import Figures
-from avatar.bench.refine import MEASURED_EVERY, Trial, driven_figures
+from avatar.bench.refine import MEASURED_EVERY, Trial, driven_figures, planned_steps
 from avatar.bench.reprojection import Placement, placement
 from avatar.bench.results import write_report
 from avatar.config import Config, load_config
@@ -33,7 +33,6 @@ from avatar.errors import UserError
 from avatar.files.video import video_writer
 from avatar.head.assets import HeadAssets
 from avatar.pipeline.cached_tracking import progress_bar
-from avatar.train.frame_order import planned_steps
 from data_prep.formats.avatar_track import LANDMARKS_FILE
 from data_prep.prepare.open_subject import find_head, open_subject
 from data_prep.track.faces.landmarks import load_landmarks

@@ -21,6 +21,7 @@ from avatar.data.frame import Frame
 from avatar.data.gpu_frame_cache import GpuFrameCache, frame_cache_bytes
 from avatar.data.loader import FrameLoader
 from avatar.data.source import Source
+from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
 from avatar.model import FlashAvatar
@@ -123,7 +124,7 @@ def make_learner(
     `perceptual` is the recorded term of a run, which its steps are timed with; None chooses as a new run would.
     """
     train = subject.split.train
-    chosen = [train[i * len(train) // FRAMES] for i in range(FRAMES)]
+    chosen = evenly_spread(train, FRAMES)
     device, is_gpu = avatar.device, on_gpu(avatar.quats)
     frame_cache = GpuFrameCache(subject, device, frame_cache_bytes(device)) if is_gpu else None
     with FrameLoader(subject, config.data.size, frame_cache=frame_cache) as loader:

@@ -22,7 +22,7 @@ from avatar.files.third_party import (
     is_published,
     lpips_place,
 )
-from avatar.head.find import find_model_file
+from avatar.head.find_head_model import find_model_file
 from avatar.version import __version__
 
 EXTRAS = {

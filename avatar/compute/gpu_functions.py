@@ -11,7 +11,7 @@ from typing import Any
 
 GPU_FUNCTIONS = {
     "pose a head": "avatar.head.pose_gpu.pose_gpu",
-    "make Gaussians": "avatar.gaussians.fused_gpu.fused_gaussians_gpu",
+    "make Gaussians": "avatar.gaussians.fused_gaussians_gpu.fused_gaussians_gpu",
     "splat": "avatar.splat.gpu.splat_gpu",
     "upload a camera's pose": "avatar.splat.gpu.pose_on",
     "Adam": "avatar.train.adam_gpu.GpuAdam",

@@ -13,9 +13,9 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from avatar.data.camera_rig import CameraRig, parse_rig
-from avatar.data.images import EVERY_LABEL
 from avatar.data.json_values import parse_object, parse_positions
-from avatar.data.refinement import Refinement
+from avatar.data.read_image import EVERY_LABEL
+from avatar.data.refinement_history import Refinement
 from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.read import MissingFile, read_json

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from avatar.data.frame import Frame
-from avatar.data.images import read_image, read_mask, read_matte
 from avatar.data.manifest import GIVEN, TRACKS_FILE, FrameRecord, Manifest, read_manifest
+from avatar.data.read_image import read_image, read_mask, read_matte
 from avatar.data.recording import Recording, checked_tracks
 from avatar.data.split import Split
 from avatar.data.tensor_file import read_tensors

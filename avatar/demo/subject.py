@@ -22,10 +22,11 @@ from avatar.demo.performance import MOTIONS, Motion, Performance, frame_camera, 
 from avatar.demo.render import RenderedFrame, Renderer
 from avatar.errors import UserError
 from avatar.files.atomic import check_target, whole_folder
+from avatar.files.write_image import write_image
 from avatar.types import Camera, HeadParams
 
 MAX_FRAMES, MIN_SIZE, MAX_SIZE = 100_000, 64, 1024
-JPEG = [cv2.IMWRITE_JPEG_QUALITY, 96, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+JPEG_QUALITY = 96
 
 
 def make_subject(
@@ -149,10 +150,10 @@ def _write_frame(
 ) -> None:
     """Image and masks are numbered from 1, the tracking from 0, as video extraction and metrical-tracker leave them."""
     stem = f"{index + 1:05d}"
-    write_image(folder / "imgs" / f"{stem}.jpg", picture.image[..., ::-1], JPEG)
-    write_image(folder / "alpha" / f"{stem}.jpg", picture.alpha, JPEG)
+    write_image(folder / "imgs" / f"{stem}.jpg", picture.image, JPEG_QUALITY)
+    write_image(folder / "alpha" / f"{stem}.jpg", picture.alpha, JPEG_QUALITY)
     for name, mask in (("neckhead", picture.head), ("mouth", picture.mouth)):
-        write_image(folder / "parsing" / f"{stem}_{name}.png", np.where(mask > 127, np.uint8(255), np.uint8(0)), [])
+        write_image(folder / "parsing" / f"{stem}_{name}.png", np.where(mask > 127, np.uint8(255), np.uint8(0)))
     K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]], np.float32)
     tracked = {
         "flame": {
@@ -170,8 +171,3 @@ def _write_frame(
         "global_step": 0,
     }
     torch.save(tracked, folder / "checkpoint" / f"{index:05d}.frame")
-
-
-def write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
-    # cv2.imwrite does not notice a full disk, and a name that is not UTF-8 ends the process.
-    path.write_bytes(cv2.imencode(path.suffix, image, options)[1].tobytes())

@@ -32,8 +32,9 @@ from avatar.demo.cameras import World, front_camera, root_joint, studio_cameras,
 from avatar.demo.head_files import write_head_model
 from avatar.demo.performance import FPS, Motion, Performance, frame_camera, frame_params, perform
 from avatar.demo.render import VIEW_AXES, PosedScene, Renderer, renderer_of
-from avatar.demo.subject import check_arguments, check_number, single_threads, write_image
+from avatar.demo.subject import check_arguments, check_number, single_threads
 from avatar.files.atomic import check_target, whole_folder
+from avatar.files.write_image import write_image
 from avatar.head.model import matrix_from_6d
 from avatar.types import Camera, HeadParams
 
@@ -120,8 +121,8 @@ def _film(folder: Path, renderer: Renderer, sequences: list[Sequence], studio: l
 def _write_picture(folder: Path, time: int, index: int, renderer: Renderer, scene: PosedScene, camera: Camera) -> None:
     """The matte ends below the neck, where GaussianAvatars' pictures are cut."""
     picture = renderer.render_scene(scene, camera)
-    write_image(folder / _image(time, index), picture.image[..., ::-1], [])
-    write_image(folder / _matte(time, index), picture.head, [])
+    write_image(folder / _image(time, index), picture.image)
+    write_image(folder / _matte(time, index), picture.head)
 
 
 def _image(time: int, camera: int) -> str:

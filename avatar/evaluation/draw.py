@@ -15,6 +15,7 @@ from avatar.data.frame import Frame
 from avatar.evaluation.measure import Pair, as_seen
 from avatar.evaluation.protocol import ImageFormat
 from avatar.files.video import ERROR_SCALE, error_map, grid, side_by_side
+from avatar.files.write_image import encode_image
 from avatar.render import Renderer
 from avatar.splat import checked_drawings
 
@@ -53,4 +54,4 @@ def contact_sheet(panels: Sequence[UInt8[np.ndarray, "H W 3"]]) -> bytes:
     if sheet.shape[1] > SHEET_WIDTH:
         height = round(sheet.shape[0] * SHEET_WIDTH / sheet.shape[1])
         sheet = cv2.resize(sheet, (SHEET_WIDTH, height), interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".png", sheet[..., ::-1])[1].tobytes()
+    return encode_image(sheet)

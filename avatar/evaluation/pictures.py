@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-import cv2
+import numpy as np
 import torch
 from jaxtyping import UInt8
 from torch import Tensor
@@ -14,6 +14,7 @@ from torch import Tensor
 from avatar.errors import UserError
 from avatar.evaluation.measure import Pair
 from avatar.evaluation.protocol import REGIONS, Region
+from avatar.files.write_image import write_image
 from avatar.tensors import to_8_bit
 
 RENDERS, TRACKED_RENDERS = "renders", "tracked_renders"
@@ -33,7 +34,7 @@ def write_pictures(
         path = folder / name / f"{index:05d}.png"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(_png(image))
+            write_image(path, _pixels(image))
         except OSError as error:
             raise UserError(f"{path} cannot be written ({error.strerror})") from error
 
@@ -44,6 +45,5 @@ def clear_pictures(folder: Path) -> None:
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
-def _png(image: Tensor) -> bytes:
-    pixels = (image if image.dtype == torch.uint8 else to_8_bit(image)).cpu().numpy()
-    return cv2.imencode(".png", pixels[..., ::-1] if pixels.ndim == 3 else pixels)[1].tobytes()
+def _pixels(image: Tensor) -> np.ndarray:
+    return (image if image.dtype == torch.uint8 else to_8_bit(image)).cpu().numpy()

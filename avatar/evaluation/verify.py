@@ -22,7 +22,7 @@ from skimage.io import imread
 from skimage.metrics import structural_similarity
 from tqdm import tqdm
 
-from avatar.data.images import MAX_BYTES
+from avatar.data.read_image import MAX_BYTES
 from avatar.errors import UserError
 from avatar.evaluation.pictures import MASK_FOLDERS, RENDERS
 from avatar.evaluation.previous_results import MAX_TABLE_BYTES

@@ -22,7 +22,7 @@ from avatar.errors import UserError
 from avatar.files.pickles import load_npy, load_npz, load_pickle
 from avatar.files.read import is_there
 from avatar.head.expression_names import ExpressionNames, load_expression_names
-from avatar.head.find import find_model_file, notes_on_choice
+from avatar.head.find_head_model import find_model_file, notes_on_choice
 from avatar.head.unwrap import LAYOUT_METHOD, NoLayout, unwrap
 from avatar.head.uv_obj import read_uv_obj
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 NOTHING = "-"  # in a table: there is no such figure
 INK, GRID = "#1d2733", "#d9dee5"  # of style.css
+JPEG_QUALITY = 85
 SERIES = ("#2563a8", "#c4572b", "#3d8a5c", "#7a4fa3")  # colours of lines and points, readable by the colour-blind
 
 
@@ -53,20 +54,17 @@ def fold(summary: Content, *content: Content) -> Markup:
     return element("details", element("summary", summary), *content)
 
 
-def picture(
-    image: np.ndarray, caption: Content = None, *, format: Literal["jpeg", "png"] = "jpeg", quality: int = 88
-) -> Markup:
+def picture(image: np.ndarray, caption: Content = None) -> Markup:
     """A figure of a uint8 image [H, W, 3] (red first) or [H, W]."""
     caption_text = element("figcaption", caption) if caption else ""
-    return element("figure", element("img", src=data_uri(image, format, quality), alt=caption or ""), caption_text)
+    return element("figure", element("img", src=data_uri(image), alt=caption or ""), caption_text)
 
 
-def data_uri(image: np.ndarray, format: Literal["jpeg", "png"] = "jpeg", quality: int = 88) -> str:
-    """A uint8 image [H, W, 3] or [H, W] inside a URL."""
+def data_uri(image: np.ndarray) -> str:
+    """A uint8 image [H, W, 3] or [H, W] as a JPEG inside a URL."""
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if format == "jpeg" else []
-    encoded = cv2.imencode(f".{format}", pixels, options)[1].tobytes()
-    return f"data:image/{format};base64,{base64.b64encode(encoded).decode()}"
+    encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    return f"data:image/jpeg;base64,{base64.b64encode(encoded).decode()}"
 
 
 def figure_of() -> tuple[Figure, Axes]:

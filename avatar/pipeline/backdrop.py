@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from avatar.data.colours import COLOURS, parse_colour
-from avatar.data.images import read_image
+from avatar.data.read_image import read_image
 from avatar.errors import UserError
 from avatar.tensors import to_8_bit
 from avatar.types import Rendering

@@ -18,9 +18,9 @@ from data_prep.formats.avatar_track import recognise
 from data_prep.prepare.checksums import find_damage, write_contents
 from data_prep.prepare.open_subject import HEAD_VARIABLE
 from data_prep.progress import Item
+from data_prep.track.cache_key import tracking_key
 from data_prep.track.faces.detect import load_mediapipe
 from data_prep.track.footage.picture_folder import is_footage, open_footage
-from data_prep.track.inputs import tracking_key
 from data_prep.track.mattes.matting_network import check_matting
 from data_prep.track.mattes.segmentation_network import matte_network
 from data_prep.track.track import Choices, track

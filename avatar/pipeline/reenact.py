@@ -23,6 +23,7 @@ from avatar.files.atomic import write_atomically
 from avatar.files.names import shortened
 from avatar.files.numbered import numbered, remove_longer
 from avatar.files.video import Sound, side_by_side, write_video
+from avatar.files.write_image import encode_image
 from avatar.head.model import HeadModel
 from avatar.motion.drive import Drive, Whose, all_moments, choose_cameras, smoothed, subject_drive
 from avatar.motion.neutral_pose import LIPS_OPEN, RestPose, chosen_frame, frame_rest, lips_apart
@@ -142,9 +143,7 @@ def drive_sound(video: Path, begins: float, drive: Drive, say: Callable[[str], N
 
 def write_pictures(out: Path, frames: Iterable[UInt8[np.ndarray, "H W C"]]) -> None:
     for number, frame in enumerate(frames):
-        order = cv2.COLOR_RGBA2BGRA if frame.shape[2] == 4 else cv2.COLOR_RGB2BGR
-        _, data = cv2.imencode(PICTURES, cv2.cvtColor(frame, order))
-        write_atomically(numbered(out, number), data.tobytes())
+        write_atomically(numbered(out, number), encode_image(frame, PICTURES))
 
 
 def first_file(out: Path) -> Path:

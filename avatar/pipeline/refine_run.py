@@ -9,13 +9,13 @@ from pathlib import Path
 
 import torch
 
-from avatar.data.refinement import Refinement, Round
+from avatar.data.refinement_history import Refinement, Round
 from avatar.files.names import shortened
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.refine_plan import FIRST_PASSES
-from avatar.pose_refinement.record import frames_csv, sheet, summary
 from avatar.pose_refinement.refine_subject import fingerprint, refine_subject
+from avatar.pose_refinement.write_results import frames_csv, sheet, summary
 from avatar.runs.model_registry import refuse_features
 from avatar.runs.run import Run
 from data_prep.formats.refined_folder import check_target, write_folder

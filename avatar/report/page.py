@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from avatar.config import flatten
-from avatar.data.images import MAX_BYTES
+from avatar.data.read_image import MAX_BYTES
 from avatar.errors import check_installed
 from avatar.evaluation.compare import read_evaluation
 from avatar.evaluation.tracking_source import LABELS, MARK, is_marked, parts, tracking_lines
@@ -199,7 +199,7 @@ def _frames(run: Run) -> list[Markup]:
     figures = [
         element(
             "figure",
-            element("img", src=data_uri(image, quality=85), alt=name),
+            element("img", src=data_uri(image), alt=name),
             element("figcaption", f"frame {name}"),
             hidden=position > 0,
         )

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from avatar.data.loader import FrameLoader
+from avatar.data.split import evenly_spread
 from avatar.evaluation.draw import panel
 from avatar.evaluation.measure import Pair
 from avatar.render import Renderer
@@ -23,13 +24,11 @@ def frame_panels(run: Run) -> list[tuple[str, np.ndarray]]:
     Driven by what the tracker left, where the tracking was refined.
     """
     subject = run.subject.as_tracked()
-    test = subject.split.test
-    chosen = [test[i * len(test) // min(MAX_FRAMES, len(test))] for i in range(min(MAX_FRAMES, len(test)))]
     background = torch.tensor(run.config.data.background)
     renderer = Renderer(run.avatar, background)
     panels = []
     with FrameLoader(subject, run.config.data.size) as loader:
-        for frame in loader.frames(chosen):
+        for frame in loader.frames(evenly_spread(subject.split.test, MAX_FRAMES)):
             with checked_drawings():
                 render = renderer.render(frame.params, frame.camera).image.clamp(0, 1).cpu()
             image = panel(Pair(render, frame.composite(background)))

@@ -24,7 +24,7 @@ from avatar.motion.orbit import OrbitLimits, orbit_limits, orbited
 from avatar.motion.statistics import MotionStatistics, learn_statistics
 from avatar.render import Renderer
 from avatar.runs.avatar_file import AVATAR_FILE, build_avatar, read_avatar_file
-from avatar.runs.inputs import check_pose, checked_camera, checked_params, checked_size
+from avatar.runs.check_inputs import check_pose, checked_camera, checked_params, checked_size
 from avatar.splat import checked_drawings
 from avatar.types import IDENTITY_6D, Camera, Gaussians, HeadParams, Rendering
 

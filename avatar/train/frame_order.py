@@ -17,13 +17,6 @@ def within_epochs(config: TrainerConfig, frames: int) -> TrainerConfig:
     return replace(config, iterations=min(config.iterations, config.max_epochs * frames))
 
 
-def planned_steps(config: TrainerConfig) -> str:
-    """How many steps that is, for a heading, before the number of frames is known."""
-    return f"{config.iterations} steps" + (
-        f", at most {config.max_epochs} epochs" if config.max_epochs is not None else ""
-    )
-
-
 def frame_order(frames: Sequence[int], seed: int, start: int, stop: int) -> Iterator[int]:
     """The frames of steps `start` to `stop` - 1: every pass over `frames` in a new random order.
 

@@ -7,12 +7,12 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-import imageio.v3 as iio
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
 from avatar.files.atomic import write_atomically
+from avatar.files.write_image import encode_image
 from avatar.losses.metrics import psnr
 from avatar.losses.photometric import PhotometricLoss
 from avatar.runs.training_curves import LOSSES, read_curves, write_curves
@@ -75,7 +75,7 @@ class TrainingLog:
         """The truth beside the render of one held-out frame, [H, W, 3] each."""
         image = to_8_bit(torch.cat((truth, render), dim=1)).cpu().numpy()
         self._previews.mkdir(parents=True, exist_ok=True)
-        write_atomically(self._previews / f"step_{step:08d}.png", iio.imwrite("<bytes>", image, extension=".png"))
+        write_atomically(self._previews / f"step_{step:08d}.png", encode_image(image))
 
 
 def smoothed(mean: float, value: float, steps: int) -> float:

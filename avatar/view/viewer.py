@@ -19,6 +19,7 @@ import numpy as np
 from avatar.errors import UserError
 from avatar.files.names import safe_name
 from avatar.files.video import write_video
+from avatar.files.write_image import encode_image
 from avatar.motion.orbit import Angles, seen_from
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.view.auth import LOCAL, AccessCheck
@@ -200,8 +201,8 @@ class Viewer:
         with self._saving(event.client) as may_save:
             if may_save:
                 picture = renderer.draw((shown.params, shown.camera), setting, self._width, shown.recorded)
-                data = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
-                event.client.send_file_download(f"{self.renderer.trained.name}.png", data, save_immediately=True)
+                name = f"{self.renderer.trained.name}.png"
+                event.client.send_file_download(name, encode_image(picture), save_immediately=True)
 
     def save_video(self, event: Any) -> None:
         """The whole motion as it is seen now."""

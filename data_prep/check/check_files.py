@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 
-from avatar.data.images import IMAGE_SUFFIXES
+from avatar.data.read_image import IMAGE_SUFFIXES
 from data_prep.check.clip import Clip
 from data_prep.check.findings import Finding, from_sentence
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, describe_numbers, gaps

@@ -16,8 +16,8 @@ from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
+from data_prep.check.examine_image import View, look_at
 from data_prep.check.findings import Severity, frames_phrase
-from data_prep.check.view import View, look_at
 from data_prep.formats.detect import METRICAL_TRACKER, open_tracked_folder
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, TRACKING, FrameFiles
 from data_prep.formats.frame_track import FrameTrack, Tracking, fit_coefficients

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from avatar.data.images import read_image
+from avatar.data.read_image import read_image
 from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from data_prep.check.clip import Clip

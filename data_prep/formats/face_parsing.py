@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.data.images import decode_image
+from avatar.data.read_image import decode_image
 
 HEAD = (*range(1, 15), 17, 18)
 MOUTH = (11, 12, 13)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar.data.images import (
+from avatar.data.read_image import (
     IMAGE_SUFFIXES,
     OTHER_PICTURES,
     decode_image,

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar.data.images import EVERY_LABEL
+from avatar.data.read_image import EVERY_LABEL
 from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from avatar.files.read import is_there

@@ -23,18 +23,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from torch import Tensor
 
-from avatar.data.images import read_matte
 from avatar.data.manifest import MASKS, Manifest
+from avatar.data.read_image import read_matte
 from avatar.data.recording import Recording
-from avatar.data.refinement import Refinement
+from avatar.data.refinement_history import Refinement
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.atomic import check_target, whole_folder
 from avatar.files.read import is_there
+from avatar.files.write_image import write_image
 from data_prep.formats import avatar_track
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TrackingInfo
 from data_prep.formats.frame_track import FrameTrack, Tracking
@@ -157,7 +157,7 @@ def _link_pictures(building: Path, subject: Subject) -> None:
                 continue
             # Labels and pictures that are their own mattes are no masks of this layout.
             mask = read_matte(file, source / record.image, label)
-            (building / kind / f"{number:05d}.png").write_bytes(cv2.imencode(".png", mask)[1].tobytes())
+            write_image(building / kind / f"{number:05d}.png", mask)
     landmarks = source / avatar_track.LANDMARKS_FILE
     if manifest.format == avatar_track.NAME and landmarks.is_file():
         _link(landmarks, building / avatar_track.LANDMARKS_FILE)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from avatar.data.refinement import Refinement
+from avatar.data.refinement_history import Refinement
 from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets

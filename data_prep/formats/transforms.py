@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
+from avatar.data.read_image import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.source import MAX_FPS
 from avatar.errors import UserError
 from avatar.files import read

@@ -10,13 +10,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from tqdm import tqdm
 
 from avatar.errors import UserError
 from avatar.files import read
 from avatar.files.atomic import temporary_name
+from avatar.files.write_image import encode_image
 from data_prep.ffmpeg import Decoder, count_pictures, describe, first_picture, rate_of
 
 _STAMP_FILE = "video.json"  # which video, its facts, and which of its pictures
@@ -145,7 +145,7 @@ def _pictures(video: WantedVideo) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _png(video: WantedVideo, pixels: np.ndarray) -> bytes:
-    return cv2.imencode(".png", pixels[..., 0] if video.is_matte else pixels[..., ::-1])[1].tobytes()
+    return encode_image(pixels[..., 0] if video.is_matte else pixels)
 
 
 def _identity(path: Path) -> list[int | str]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from avatar.data.images import read_image
+from avatar.data.read_image import read_image
 from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, FrameFiles

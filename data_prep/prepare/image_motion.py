@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from avatar.data.images import read_image
+from avatar.data.read_image import read_image
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_track import FrameTrack
 from data_prep.prepare.projection import project_head

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avatar.data.images import read_bytes, read_image
+from avatar.data.read_image import read_bytes, read_image
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, MOUTH, PARSING, TRACKING, FrameFiles
 from data_prep.formats.frame_track import Tracking

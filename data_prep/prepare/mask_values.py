@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from avatar.data.images import decode_image, decode_values, read_bytes
+from avatar.data.read_image import decode_image, decode_values, read_bytes
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, HEAD, MOUTH, FrameFiles
 from data_prep.formats.tracked_folder import Shot, spread_by_camera

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from avatar.data.manifest import Manifest
+from avatar.files.write_image import write_image
 from avatar.head.model import HeadModel
 from data_prep.formats import frame_files
 from data_prep.formats.face_parsing import HEAD, MOUTH, mask_of
@@ -48,14 +48,10 @@ def derive_masks(
     for record, (image, number) in zip(manifest.frames, pairs, strict=True):
         head, mouth = read_masks(files, image) if image in files.parsing else (None, None)
         if manifest.head_masks == "derived" and head is not None:
-            _write(building / str(record.head_mask), head)
+            write_image(building / str(record.head_mask), head)
         if manifest.mouth_masks == "derived":
             if mouth is None:
                 track = tracks.frames[number]
                 screen = project_head(model, track, track.intrinsics, *track.size)
                 mouth = filled_lips(screen, lips, *track.size).astype(np.uint8) * 255
-            _write(building / str(record.mouth_mask), mouth)
-
-
-def _write(path: Path, mask: np.ndarray) -> None:
-    path.write_bytes(cv2.imencode(".png", mask)[1].tobytes())  # cv2.imwrite does not notice a full disk
+            write_image(building / str(record.mouth_mask), mouth)

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from avatar.data.images import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE
+from avatar.data.read_image import IMAGE_SUFFIXES, OTHER_PICTURES
 from avatar.data.source import MAX_FPS, Source
 from avatar.errors import UserError
 from avatar.files.names import typed
-from avatar.head.find import candidates
+from avatar.head.find_head_model import candidates
 from data_prep.formats import avatar_track, nersemble, nha
 from data_prep.formats.transforms import read_json
 

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from avatar.compute.workers import in_order
 from avatar.errors import UserError
+from avatar.files.write_image import write_image
 from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress
 from data_prep.track.faces.landmarks import Landmarks
@@ -20,8 +20,6 @@ from data_prep.track.footage.source import Footage, Span, TimedPicture, View
 from data_prep.track.mattes.despill import despilled
 from data_prep.track.mattes.user_mattes import OPAQUE, OwnMattes, share_on
 
-# JPEG without subsampled colours: its size and error beside PNG are in docs/bench/track_results.md.
-JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 WORKERS = 2
 MAX_WITHOUT = 0.1  # of the frames may have a given matte that leaves out the face
 Made = TypeVar("Made")
@@ -51,7 +49,7 @@ def write_frames(folder: Path, footage: Footage, view: View, span: Span, look: F
     """The view of every picture with the face, by frame number, as JPEG."""
     pictures = footage.read(view, span, lambda _: None)
     for number, picture in _chosen(pictures, footage.path, look, progress, "writing frames"):
-        write_image(frame_file(folder, number), cv2.cvtColor(picture.image, cv2.COLOR_RGB2BGR), JPEG)
+        write_image(frame_file(folder, number), picture.image)
 
 
 def write_given_mattes(
@@ -63,7 +61,7 @@ def write_given_mattes(
     without = []
     pictures = mattes.read(view, span)
     for number, picture in _chosen(pictures, mattes.footage.path, look, progress, "writing mattes"):
-        write_image(mask_file(folder, number), picture.image, [])
+        write_image(mask_file(folder, number), picture.image)
         if share_on(points[number, :, :2], picture.image)[0] < OPAQUE:
             without.append(number)
     total = int(look.landmarks.detected.sum())
@@ -107,7 +105,7 @@ def write_masks(
     """What `make` gives for each frame number, as PNG; made by some threads, in any order."""
 
     def one(number: int) -> None:
-        write_image(mask_file(folder, number), make(number), [])
+        write_image(mask_file(folder, number), make(number))
 
     for _ in ahead(numbers, one, progress, title):
         pass
@@ -119,8 +117,7 @@ def write_despilled(
     """The frames as `despill.despilled` makes them, as JPEG; by some threads."""
 
     def one(number: int) -> None:
-        made = despilled(images(number), mattes(number), width)
-        write_image(frame_file(folder, number), cv2.cvtColor(made, cv2.COLOR_RGB2BGR), JPEG)
+        write_image(frame_file(folder, number), despilled(images(number), mattes(number), width))
 
     for _ in ahead(numbers, one, progress, "cleaning the outline"):
         pass
@@ -132,8 +129,3 @@ def ahead(
     """Each frame number with what `make` gives for it, in order; made by some threads, a few frames ahead."""
     made = in_order(make, numbers, WORKERS)
     yield from zip(numbers, progress(made, len(numbers), title), strict=True)
-
-
-def write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
-    data = cv2.imencode(path.suffix, image, options)[1]
-    path.write_bytes(data.tobytes())  # cv2.imwrite does not notice a full disk

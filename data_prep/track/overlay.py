@@ -9,13 +9,15 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from avatar.data.split import evenly_spread
 from avatar.files.video import SHARP, grid, video_writer
+from avatar.files.write_image import write_image
 from avatar.head.model import HeadModel
 from data_prep.check.overlay import MASK, MOUTH, draw_mesh, outline
 from data_prep.formats.frame_track import FrameTrack
 from data_prep.prepare.mask_overlap import MeshProjector
 from data_prep.progress import Progress
-from data_prep.track.frames import JPEG, ahead, write_image
+from data_prep.track.frames import ahead
 
 OVERLAY_VIDEO, OVERLAY_SHEET = "overlay.mp4", "overlay.jpg"
 _SHOWN, _COLUMNS = 12, 4  # pictures in the sheet
@@ -41,7 +43,7 @@ def write_overlay(
     width, height = round(first.size[0] * SHARP / first.size[1]), SHARP
     resampling = cv2.INTER_AREA if first.size[1] > height else cv2.INTER_CUBIC
     numbers = list(tracks)
-    shown = {numbers[round(i)] for i in np.linspace(0, len(numbers) - 1, min(_SHOWN, len(numbers)))}
+    shown = set(evenly_spread(numbers, _SHOWN))
     pictures: list[np.ndarray] = []
 
     def draw(number: int) -> np.ndarray:
@@ -57,6 +59,4 @@ def write_overlay(
             add(canvas)
             if number in shown:
                 pictures.append(canvas)
-    write_image(
-        folder / OVERLAY_SHEET, cv2.cvtColor(grid(pictures, min(_COLUMNS, len(pictures))), cv2.COLOR_RGB2BGR), JPEG
-    )
+    write_image(folder / OVERLAY_SHEET, grid(pictures, min(_COLUMNS, len(pictures))))

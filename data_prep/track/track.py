@@ -33,6 +33,7 @@ from data_prep.formats.avatar_track import (
 )
 from data_prep.formats.frame_files import describe_numbers
 from data_prep.progress import Progress, silent
+from data_prep.track.cache_key import look_inputs, tracking_key
 from data_prep.track.faces.detect import FaceDetector
 from data_prep.track.faces.landmarks import load_landmarks, save_landmarks
 from data_prep.track.first_pass import FirstPass, from_json, look_at, to_json
@@ -41,7 +42,6 @@ from data_prep.track.footage.picture_folder import open_footage
 from data_prep.track.footage.rotated import turned
 from data_prep.track.footage.source import Footage, View, check_span
 from data_prep.track.frames import in_view
-from data_prep.track.inputs import look_inputs, tracking_key
 from data_prep.track.mattes.matting_network import check_matting
 from data_prep.track.mattes.segmentation_network import matte_network
 from data_prep.track.mattes.user_mattes import OwnMattes, open_mattes, refuse_mattes_of_others

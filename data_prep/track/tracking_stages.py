@@ -8,11 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from avatar.data.images import read_image, read_mask
+from avatar.data.read_image import read_image, read_mask
 from avatar.files.third_party import ThirdPartyFile
 from avatar.head.assets import HeadAssets
 from data_prep.formats.avatar_track import FRAMES, HEAD, MATTE, MOUTH, TRACKS_FILE
 from data_prep.progress import Progress
+from data_prep.track.cache_key import head_inputs
 from data_prep.track.crop import choose_view
 from data_prep.track.faces.landmarks import Landmarks
 from data_prep.track.first_pass import FirstPass
@@ -31,7 +32,6 @@ from data_prep.track.frames import (
     write_given_mattes,
     write_masks,
 )
-from data_prep.track.inputs import head_inputs
 from data_prep.track.masks.clothes import CLIP_FRAMES, learn_colours
 from data_prep.track.masks.head_and_mouth import head_mask, mouth_mask, neck_ring
 from data_prep.track.masks.neck_zones import Zones, zones_of

@@ -20,8 +20,8 @@ from avatar.bench.refine import Figures, Row, recovered, report, vertex_error
 from avatar.cli import main
 from avatar.data.recording import Recording
 from avatar.gaussians.base_model import Avatar
-from avatar.pose_refinement.record import movements
 from avatar.pose_refinement.tracking_values import EXPRESSION, EYELIDS, NECK, values_of
+from avatar.pose_refinement.write_results import movements
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import torch
 
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 from avatar.head.assets import HeadAssets, load_head_assets
 
 OPENGL = np.diag([1.0, -1.0, -1.0])  # OpenCV camera axes <-> OpenGL camera axes

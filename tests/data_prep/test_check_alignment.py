@@ -18,7 +18,7 @@ from importing import import_folder
 from tracked_folder import write_head_model, write_tracked_folder
 
 from avatar.cli import main
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError

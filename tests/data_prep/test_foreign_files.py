@@ -13,7 +13,7 @@ from importing import FRAMES, import_folder
 from PIL import Image
 from tracked_folder import write_tracked_folder
 
-from avatar.data.images import read_image
+from avatar.data.read_image import read_image
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets

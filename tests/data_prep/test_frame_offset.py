@@ -14,7 +14,7 @@ import torch
 from preparing import prepare_folder
 from tracked_folder import write_tracked_folder
 
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel

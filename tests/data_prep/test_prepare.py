@@ -11,7 +11,7 @@ import torch
 from preparing import edit, prepare_folder
 from tracked_folder import write_tracked_folder
 
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets

@@ -15,7 +15,7 @@ import torch
 from nha_folder import write_nha
 from tracked_folder import write_tracked_folder
 
-from avatar.data.refinement import Refinement, Round
+from avatar.data.refinement_history import Refinement, Round
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError

@@ -14,7 +14,7 @@ import pytest
 import torch
 from camera_rig_folder import edited, write_listings, write_single, write_union
 
-from avatar.data.refinement import Refinement, Round
+from avatar.data.refinement_history import Refinement, Round
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError

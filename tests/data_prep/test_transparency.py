@@ -14,7 +14,7 @@ import torch
 from exports import write_imavatar, write_insta, write_vhap
 from importing import FRAMES, import_folder
 
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 from avatar.data.subject import Subject
 from avatar.head.assets import load_head_assets
 from data_prep.check.folder import Check, check_tracked_folder

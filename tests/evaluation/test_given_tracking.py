@@ -10,7 +10,7 @@ import pytest
 import torch
 from disc import TEST, make_run
 
-from avatar.data.refinement import Refinement, Round
+from avatar.data.refinement_history import Refinement, Round
 from avatar.data.subject import Subject
 from avatar.evaluation.evaluate import evaluate
 from avatar.evaluation.tracking_source import OF_MARK, describe_tracking, tracking_notes

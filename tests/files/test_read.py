@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from special_files import SPECIAL
 
-from avatar.data.images import read_image, read_mask
+from avatar.data.read_image import read_image, read_mask
 from avatar.errors import UserError
 from avatar.evaluation.compare import read_evaluation
 from avatar.evaluation.verify import verify

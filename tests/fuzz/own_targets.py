@@ -15,7 +15,7 @@ from lively import lively_run
 from target import Target, member, of_copy, on_disk, with_member
 from tracked_folder import write_tracked_folder
 
-from avatar.data.refinement import Refinement, Round
+from avatar.data.refinement_history import Refinement, Round
 from avatar.data.source import Source
 from avatar.errors import refuse
 from avatar.head.assets import load_head_assets

@@ -24,7 +24,7 @@ from target import Reader, Target, member, of_copy, on_disk, with_member
 from tracked_folder import write_tracked_folder
 
 from avatar.config import load_config
-from avatar.data.images import decode_image, decode_mask, decode_transparency
+from avatar.data.read_image import decode_image, decode_mask, decode_transparency
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError, refuse

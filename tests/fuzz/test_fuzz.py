@@ -29,7 +29,7 @@ from target import Target
 from targets import make_targets
 from watch import Forbidden, memory_cap, watched
 
-from avatar.data.images import MAX_PIXELS, decode_image, decode_mask
+from avatar.data.read_image import MAX_PIXELS, decode_image, decode_mask
 from avatar.errors import UserError
 from avatar.files.pickles import load_npy, load_npz, load_pickle
 

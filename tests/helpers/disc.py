@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import save_file
 
 from avatar.data.manifest import MANIFEST_FILE, TRACKS_FILE, FrameRecord, Manifest
-from avatar.data.refinement import Refinement, Round
+from avatar.data.refinement_history import Refinement, Round
 from avatar.data.subject import Subject
 from avatar.splat import splat
 from avatar.types import Camera, Gaussians, HeadParams, Rendering

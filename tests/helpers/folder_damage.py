@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import torch
 
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 
 FRAMES = 24  # one bad frame is under the 5% limit, two are over it
 Edit = Callable[[Path], object]

@@ -36,7 +36,7 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
     import triton.language as tl
     from triton.runtime import interpreter
 
-    from avatar.gaussians import fused_gpu
+    from avatar.gaussians import fused_gaussians_gpu
     from avatar.losses import gpu as losses_gpu
     from avatar.splat import gpu_draw
     from avatar.train import adam_gpu
@@ -44,8 +44,8 @@ def quick_interpreter(patch: pytest.MonkeyPatch) -> Iterator[None]:
     lanes = {"lanes": 1024, "backward_lanes": 1024, "summed": 256, "summed_lanes": 4}
     wide = gpu_draw.Tuning(tile=16, step=32, backward_step=32, **lanes)
     patch.setattr(gpu_draw, "TUNING", wide)
-    patch.setattr(fused_gpu, "LANES", 1024)
-    patch.setattr(fused_gpu, "ENTRIES", 256)
+    patch.setattr(fused_gaussians_gpu, "LANES", 1024)
+    patch.setattr(fused_gaussians_gpu, "ENTRIES", 256)
     patch.setattr(losses_gpu, "LANES", 8192)
     patch.setattr(adam_gpu, "LANES", 1 << 16)
     # Its search for integers that overflow takes a quarter of the time, and tells nobody unless Triton is being debugged.

@@ -41,12 +41,11 @@ def test_columns_without_anything_are_left_out() -> None:
 
 
 def test_an_image_comes_back_from_its_url() -> None:
-    image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    head, _, data = data_uri(image, "png").partition(",")
-    assert head == "data:image/png;base64"
+    image = np.full((5, 7, 3), (200, 100, 50), np.uint8)
+    head, _, data = data_uri(image).partition(",")
+    assert head == "data:image/jpeg;base64"
     decoded = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-    np.testing.assert_array_equal(decoded[..., ::-1], image)
-    assert data_uri(image).startswith("data:image/jpeg;base64,")
+    np.testing.assert_allclose(decoded[..., ::-1].astype(int), image, atol=3)
     assert SAFE in picture(image, NASTY)
 
 

@@ -17,7 +17,6 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement import refine_subject as refine_module
-from avatar.pose_refinement.record import COLUMNS, frames_csv, movements, sheet, sheet_frames, summary
 from avatar.pose_refinement.refine_subject import (
     SAMPLES,
     Refined,
@@ -27,6 +26,7 @@ from avatar.pose_refinement.refine_subject import (
     refine_subject,
 )
 from avatar.pose_refinement.tracking_values import EXPRESSION, values_of
+from avatar.pose_refinement.write_results import COLUMNS, frames_csv, movements, sheet, sheet_frames, summary
 
 
 @pytest.fixture(scope="module")

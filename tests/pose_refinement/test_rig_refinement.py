@@ -21,8 +21,8 @@ from avatar.data.subject import Subject
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement import fitted_pictures as fitted_module
 from avatar.pose_refinement.fitted_pictures import fitted_pictures
-from avatar.pose_refinement.record import frames_csv, sheet, summary
 from avatar.pose_refinement.refine_subject import Refined, refine_subject
+from avatar.pose_refinement.write_results import frames_csv, sheet, summary
 
 TIMES, VIEWS, HELD_OUT = 6, 3, 2  # times 4 and 5 and the last camera are held out
 

@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 
 from avatar.errors import UserError
+from avatar.files.write_image import write_image
 from data_prep.track.camera_rig.recording import Recording
 from data_prep.track.faces.detect import Face, FaceDetector
 from data_prep.track.first_pass import DETECTION_SIDE
 from data_prep.track.footage.picture_folder import resampled
 from data_prep.track.footage.source import Box, Footage, Span, View, whole
-from data_prep.track.frames import JPEG, frame_file, mask_file, write_image
+from data_prep.track.frames import frame_file, mask_file
 
 _SAMPLES = 3  # first pictures, by which the front camera is found
 _LEFT_EYE, _RIGHT_EYE, _MOUTH = 263, 33, 13  # landmarks of a plane that the face looks along the normal of
@@ -87,7 +88,7 @@ def write_pictures(
         for number, image in timed:
             large = View(Box(0, 0, image.shape[1], image.shape[0]), view.width, view.height)
             small = resampled(image, large)
-            write_image(frame_file(folder, number), cv2.cvtColor(small, cv2.COLOR_RGB2BGR), JPEG)
+            write_image(frame_file(folder, number), small)
             faces = detector.find(image)
             scale = np.array([view.width / image.shape[1], view.height / image.shape[0]])
             points = faces[0].points[landmarks, :2] * scale if faces else None
@@ -97,4 +98,4 @@ def write_pictures(
 
 def copy_mattes(folder: Path, mattes: Footage, view: View, times: Times) -> None:
     for number, image in times.pick(mattes, view):
-        write_image(mask_file(folder, number), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), [])
+        write_image(mask_file(folder, number), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 from avatar.errors import UserError
 from avatar.files.pickles import load_npz
 from data_prep.formats.frame_track import BadFrame, pinhole_of, rigid_motion, vector

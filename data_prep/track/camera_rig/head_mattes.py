@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avatar.data.images import read_image, read_mask
+from avatar.data.read_image import read_image, read_mask
 from avatar.files.third_party import ThirdPartyFile
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel

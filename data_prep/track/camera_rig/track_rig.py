@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from avatar.data.images import read_image
+from avatar.data.read_image import read_image
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets
 from avatar.head.model import HeadModel
@@ -27,6 +27,7 @@ from data_prep.formats.frame_track import FrameTrack
 from data_prep.prepare.camera_rig import Pose
 from data_prep.prepare.projection import head_params, project_head
 from data_prep.progress import Progress, silent
+from data_prep.track.cache_key import look_inputs, tracking_key
 from data_prep.track.camera_rig import gha_folder, recording
 from data_prep.track.camera_rig.camera_pictures import Times, copy_mattes, detection_view, find_front, write_pictures
 from data_prep.track.camera_rig.head_mattes import MatteClip, front_colours, write_head_mattes
@@ -37,7 +38,6 @@ from data_prep.track.faces.embedding import LandmarkEmbedding
 from data_prep.track.fit.fit_clip import find_embedding
 from data_prep.track.footage.source import MIN_SIDE, Span, check_span, whole
 from data_prep.track.frames import frame_file
-from data_prep.track.inputs import look_inputs, tracking_key
 from data_prep.track.masks.clothes import Colours
 from data_prep.track.mattes.segmentation_network import matte_network
 from data_prep.track.stage_folder import StageFolder, growing, hash_of, writing

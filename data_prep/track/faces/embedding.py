@@ -14,7 +14,7 @@ from avatar.errors import UserError
 from avatar.files.pickles import load_npz, save_npz
 from avatar.files.read import is_there
 from avatar.head.assets import HeadAssets
-from avatar.head.find import find_model_file
+from avatar.head.find_head_model import find_model_file
 from avatar.head.model import LEFT_EYE, RIGHT_EYE
 from data_prep.track.faces.landmark_groups import LEFT_IRIS, NUM_MESH, RIGHT_IRIS
 

@@ -17,9 +17,9 @@ from data_prep.track.faces.embedding import LandmarkEmbedding, iris_embedding, o
 from data_prep.track.faces.rendered_embedding import cached_embedding, rendered_embedding
 from data_prep.track.fit.camera import Pinhole
 from data_prep.track.fit.chunks import side_by_side
-from data_prep.track.fit.covered import COVERED_SHARE
 from data_prep.track.fit.frame_poses import Motion, six_d
 from data_prep.track.fit.landmark_fit import LandmarkFit, fit_landmarks
+from data_prep.track.fit.occlusion import COVERED_SHARE
 from data_prep.track.fit.photometric_fit import fit_pictures
 from data_prep.track.fit.result import Clip, Fit
 from data_prep.track.quality import landmark_figures

@@ -22,12 +22,12 @@ from data_prep.progress import Progress
 from data_prep.track.faces import landmark_groups as groups
 from data_prep.track.fit.camera import Pinhole, to_camera
 from data_prep.track.fit.chunks import over_chunks
-from data_prep.track.fit.covered import covered_shares
 from data_prep.track.fit.crops import BlurredCrops, Crops, Images, Mattes, cut_out
 from data_prep.track.fit.frame_poses import Motion, at_rest
 from data_prep.track.fit.landmark_fit import POINT_SHARE, LandmarkFit, eye_distance
 from data_prep.track.fit.landmark_term import LandmarkTerm
 from data_prep.track.fit.levenberg_marquardt import minimise
+from data_prep.track.fit.occlusion import covered_shares
 from data_prep.track.fit.photometric_term import PhotometricTerm, SkinValues
 from data_prep.track.fit.skin_points import seen_weights, skin_triangles, spread_points
 from data_prep.track.fit.surface import SurfacePoints

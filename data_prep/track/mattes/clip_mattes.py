@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from avatar.files.third_party import MATTING_FILES, ThirdPartyFile
+from avatar.files.write_image import write_image
 from data_prep.progress import Progress
-from data_prep.track.frames import Read, ahead, mask_file, write_image, write_masks
+from data_prep.track.frames import Read, ahead, mask_file, write_masks
 from data_prep.track.mattes import background_plate
 from data_prep.track.mattes.alike_frames import ClipFrame, clip_frame, person_alone
 from data_prep.track.mattes.matting_network import open_matting
@@ -33,7 +34,7 @@ def write_mattes(
     if network in MATTING_FILES:
         matte = open_matting(network)
         for number in progress(numbers, len(numbers), _TITLE):
-            write_image(mask_file(folder, number), matte(image(number)), [])
+            write_image(mask_file(folder, number), matte(image(number)))
         return
     own = threading.local()  # a network is for one thread
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from avatar.data.images import decode_image, decode_mask, decode_values, read_bytes
+from avatar.data.read_image import decode_image, decode_mask, decode_values, read_bytes
 from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from data_prep.prepare.mask_values import SAMPLES, coloured_sentence, is_coloured, judge_range, only_label

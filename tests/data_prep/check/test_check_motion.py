@@ -15,7 +15,7 @@ from folder_damage import FRAMES, Edit, edit_frame, every, set_K
 from preparing import prepare_folder
 from tracked_folder import write_tracked_folder
 
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep.check.findings import Finding

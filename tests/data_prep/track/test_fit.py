@@ -20,10 +20,10 @@ from data_prep.progress import silent
 from data_prep.track.faces.landmark_groups import LIPS, NOSE
 from data_prep.track.fit import photometric_fit
 from data_prep.track.fit.camera import to_camera
-from data_prep.track.fit.covered import COVERED_SHARE
 from data_prep.track.fit.fit_clip import as_tracks
 from data_prep.track.fit.frame_poses import Motion, at_rest
 from data_prep.track.fit.landmark_fit import LandmarkFit, eye_distance, fit_landmarks
+from data_prep.track.fit.occlusion import COVERED_SHARE
 from data_prep.track.fit.photometric_fit import fit_pictures
 from data_prep.track.fit.surface import SurfacePoints
 

@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
-from avatar.data.images import read_image
+from avatar.data.read_image import read_image
 from avatar.head.assets import load_head_assets
 from avatar.head.model import HeadModel
 from data_prep.formats.metrical_tracker import read_tracking

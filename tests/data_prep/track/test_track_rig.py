@@ -14,7 +14,7 @@ from rig_recording import serial_of, write_gha, write_raw
 from small_runs import SMALL
 
 from avatar.cli import main
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 from avatar.demo import vhap_folder
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets

@@ -18,10 +18,10 @@ from tracked_folder import write_head_model
 from avatar.files.third_party import FACE_LANDMARKER, FOLDER_VARIABLE, SELFIE_MULTICLASS
 from avatar.head.assets import load_head_assets
 from avatar.pipeline import cached_tracking as caching
-from data_prep.track import inputs
+from data_prep.track import cache_key
+from data_prep.track.cache_key import head_inputs, tracking_key
 from data_prep.track.faces.embedding import OFFICIAL_FILE
 from data_prep.track.footage.source import Box, Span
-from data_prep.track.inputs import head_inputs, tracking_key
 from data_prep.track.stage_folder import StageFolder
 from data_prep.track.tracking_stages import Choices, TrackingStages
 
@@ -101,9 +101,9 @@ def test_another_video_landmarker_or_version_makes_another(head: Path, monkeypat
     before = key(head)
     assert key(head, video="cd") != before
     with monkeypatch.context() as patch:
-        patch.setattr(inputs, "FACE_LANDMARKER", FACE_LANDMARKER._replace(sha256="0"))
+        patch.setattr(cache_key, "FACE_LANDMARKER", FACE_LANDMARKER._replace(sha256="0"))
         assert key(head) != before
-    monkeypatch.setattr(inputs, "STAGES_VERSION", 0)
+    monkeypatch.setattr(cache_key, "STAGES_VERSION", 0)
     assert key(head) != before
 
 
@@ -116,7 +116,7 @@ def test_every_option_of_a_tracking_is_in_its_key(head: Path) -> None:
 def test_a_landmark_that_lies_elsewhere_makes_another(head: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no embedding lies beside the head model, its recipe counts."""
     before = key(head)
-    monkeypatch.setattr(inputs, "RECIPE", 0)
+    monkeypatch.setattr(cache_key, "RECIPE", 0)
     assert key(head) != before
 
 

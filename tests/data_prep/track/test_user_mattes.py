@@ -14,7 +14,7 @@ from marked_face import HEIGHT, WIDTH, matte, picture
 from PIL import Image
 from videos import LOSSLESS, X264, encode, ffmpeg
 
-from avatar.data.images import read_mask
+from avatar.data.read_image import read_mask
 from avatar.errors import UserError
 from data_prep.formats.avatar_track import read_info
 from data_prep.track.footage.picture_folder import open_footage

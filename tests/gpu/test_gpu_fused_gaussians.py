@@ -76,7 +76,7 @@ class Scene:
             return apply_offsets(points, *base, self.sh, values)
 
     def found(self, vertices: Tensor, values: Tensor, packed: Tensor | None, *rest: Any) -> Gaussians:
-        from avatar.gaussians.fused_gpu import fused_gaussians_gpu
+        from avatar.gaussians.fused_gaussians_gpu import fused_gaussians_gpu
 
         self.embedding.move(DEVICE)
         if self.grid is not None:

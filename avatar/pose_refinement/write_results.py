@@ -7,7 +7,6 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -17,6 +16,7 @@ from avatar.data.recording import Recording
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
 from avatar.files.video import ERROR_SCALE, error_map, padded, side_by_side
+from avatar.files.write_image import encode_image
 from avatar.gaussians.base_model import Avatar
 from avatar.pose_refinement.fitted_pictures import fitted_pictures
 from avatar.pose_refinement.refine_subject import Refined
@@ -105,7 +105,7 @@ def sheet(
         rows.append(side_by_side((truth, *renders, *errors), captions))
     width = max(row.shape[1] for row in rows)
     filled = np.concatenate([padded(row, len(row), width) for row in rows])
-    return cv2.imencode(".png", filled[..., ::-1])[1].tobytes()
+    return encode_image(filled)
 
 
 def sheet_frames(test: Sequence[int], refined: Refined) -> list[int]:

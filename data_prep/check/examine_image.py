@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from skimage.measure import label
 
-from avatar.data.images import read_bytes
+from avatar.data.read_image import read_bytes
 from avatar.data.subject import head_of_matte
 from avatar.errors import UserError
 from data_prep.formats import face_parsing

@@ -4,7 +4,7 @@ import triton
 import triton.language as tl
 
 from avatar.kernels.activations import normalized_backward, product, sigmoid, tanh, tanh_slope
-from avatar.kernels.fused import turned
+from avatar.kernels.fused_gaussians import turned
 from avatar.kernels.hyper import (
     CONSTANTS,
     DIMENSION,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from avatar.data.images import read_image, read_mask, read_matte
+from avatar.data.read_image import read_image, read_mask, read_matte
 from avatar.errors import UserError
 
 MATTE = np.array([[0, 1, 9, 10], [40, 128, 254, 255]], np.uint8)

@@ -13,8 +13,8 @@ from avatar.compute.device import to_device
 from avatar.gaussians.hyper_cpu import Interpolation, Touching, packed_shape
 from avatar.gaussians.skull_binding import SkullBinding
 from avatar.head.model import matrix_from_6d
-from avatar.kernels.fused import fused_gaussians
-from avatar.kernels.fused_backward import fused_gaussians_backward, gather_nodes
+from avatar.kernels.fused_gaussians import fused_gaussians
+from avatar.kernels.fused_gaussians_backward import fused_gaussians_backward, gather_nodes
 from avatar.kernels.launch import start
 from avatar.tensors import check_shapes
 from avatar.types import Gaussians

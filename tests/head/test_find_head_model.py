@@ -12,7 +12,7 @@ from tracked_folder import write_head_model
 from avatar.errors import UserError
 from avatar.files.pickles import load_pickle
 from avatar.head.assets import load_head_assets
-from avatar.head.find import find_model_file
+from avatar.head.find_head_model import find_model_file
 
 
 @pytest.fixture
