@@ -14,25 +14,27 @@ AVATAR_MUTATIONS = [
         "0.0 * x3\n",
     ),
     Mutation(
-        "fused",
+        "fused_gaussians",
         "the offset turns before the base",
         "product(bw, bx, by, bz, tl.exp(r0), r1, r2, r3)",
         "product(tl.exp(r0), r1, r2, r3, bw, bx, by, bz)",
     ),
     Mutation(
-        "fused_backward",
+        "fused_gaussians_backward",
         "a factor's diagonal is taken as it is stored",
         "-s1 * q1 * tl.exp(row(values, FACTOR + 2, mask))",
         "-s1 * q1",
     ),
     Mutation(
-        "fused_backward",
+        "fused_gaussians_backward",
         "lanes without a Gaussian are not written",
         "_put(grads, at + 12, q9 * from_mean, all_lanes)",
         "_put(grads, at + 12, q9 * from_mean, mask)",
         first="lanes_that_stand",
     ),
-    Mutation("fused_backward", "a node's list ends an entry early", "begins + node + 1)", "begins + node + 1) - 1"),
+    Mutation(
+        "fused_gaussians_backward", "a node's list ends an entry early", "begins + node + 1)", "begins + node + 1) - 1"
+    ),
     Mutation("activations", "tanh is wrong where it saturates", "tl.where(x < 0.0, -far, far)", "far"),
     # Posing and losses.
     Mutation(

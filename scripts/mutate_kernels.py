@@ -23,7 +23,7 @@ BACKENDS, SPLAT_FEATURES, BUFFERS, HOSTILE, PLACE = (
         ("splat", "splat_features"),
         ("gpu", "gpu_buffers"),
         ("gpu", "gpu_hostile"),
-        ("gpu", "gpu_fused"),
+        ("gpu", "gpu_fused_gaussians"),
     )
 )
 LOOPS = BACKENDS + "test_image_and_alpha_are_those_of_the_definition_written_as_loops"
@@ -67,7 +67,7 @@ LOSSES = ["tests/gpu/test_gpu_losses.py", HOSTILE + "test_the_same_bits_and_whol
 ADAM = ["tests/gpu/test_gpu_adam.py"]
 # Of a module; of the others SPLATTER.
 TESTS = {
-    **dict.fromkeys(("activations", "hyper", "fused", "fused_backward"), FUSED),
+    **dict.fromkeys(("activations", "hyper", "fused_gaussians", "fused_gaussians_backward"), FUSED),
     **dict.fromkeys(("huber", "reduce", "ssim"), LOSSES),
     "pose": POSING,
     "adam": ADAM,

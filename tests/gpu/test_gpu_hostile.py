@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from gpu.test_gpu_fused import Scene as Placing
+from gpu.test_gpu_fused_gaussians import Scene as Placing
 from gpu.test_gpu_losses import images
 from gpu.test_gpu_pose import HEAD
 from heads import random_params
