@@ -1,4 +1,4 @@
-"""Which frames are trained on and which are held out."""
+"""The train/test split, and its rule for a clip that says nothing of its own: the last frames are held out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which frames of a tracked folder are trained on, and which are held out."""
+"""The split of a tracked folder: its own where it has one, else the rule of `avatar.data.split`; and its chosen cameras."""
 
 from __future__ import annotations
 
