@@ -12,7 +12,7 @@
 
 // What the compiled functions demand of their arguments, so that none can read or write beyond an array. The order of its
 // values, its type and its device are demanded by the type Array; ranks, sizes and the range of indices here, in the words
-// of avatar/check.py.
+// of avatar/tensors.py.
 namespace avatar {
 
 // An array in C order on the CPU that a caller lends for the time of a call.
@@ -111,7 +111,7 @@ void check_indices(const std::string& name, const Array<const std::int32_t>& ind
 // Of the places where one part after the other begins, the last one ending at `end`.
 void check_begins(const std::string& name, const Array<const std::int64_t>& begins, std::int64_t end);
 
-inline void check_threads(int threads) { check_within("threads", threads, 1, 1024); }  // as avatar/native.py
+inline void check_threads(int threads) { check_within("threads", threads, 1, 1024); }  // as avatar/compute/native.py
 
 }  // namespace avatar
 

@@ -1,7 +1,8 @@
 #pragma once
 #include <cstddef>
 
-// Structural dissimilarity of two masked images with its gradient, without Python: what avatar/dssim_cpu.py documents.
+// Structural dissimilarity of two masked images with its gradient, without Python: what
+// avatar/losses/dssim_cpu.py documents.
 //
 // With u = x + y and v = x - y, and m and s for mean and variance over a window,
 //     SSIM = (1 - a) (1 - b),   a = m_v^2 / ((m_u^2 + m_v^2) / 2 + C1),   b = s_v / ((s_u + s_v) / 2 + C2),
