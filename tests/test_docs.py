@@ -58,11 +58,14 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def test_pages_that_the_code_names_exist() -> None:
-    for folder in ("avatar", "data_prep", "scripts", "configs"):
+def test_files_that_code_and_pages_name_exist() -> None:
+    named = re.compile(
+        r"\b(?:avatar|data_prep|scripts|tests|configs|docs)/[\w/]+\.(?:py|js|cpp|h|sh|toml|yaml|md|csv)\b"
+    )
+    for folder in ("avatar", "data_prep", "scripts", "configs", "docs"):
         for file in (ROOT / folder).rglob("*"):
-            if file.suffix in {".py", ".h", ".cpp", ".yaml", ".sh", ".js"}:
-                for name in re.findall(r"docs/[\w/]+\.(?:md|csv)", file.read_text(encoding="utf-8")):
+            if file.suffix in {".py", ".h", ".cpp", ".yaml", ".sh", ".js", ".md"}:
+                for name in named.findall(file.read_text(encoding="utf-8")):
                     assert (ROOT / name).exists(), f"{file.relative_to(ROOT)} names {name}"
 
 
