@@ -23,7 +23,6 @@ from avatar.bench.machine import limited_to
 from avatar.bench.results import write_report
 from avatar.bench.stages import Stopwatch
 from avatar.compute.device import on_gpu, to_device
-from avatar.data.split import evenly_spread
 from avatar.errors import UserError
 from avatar.model import FlashAvatar
 from avatar.render import Renderer
@@ -104,7 +103,7 @@ def measure(trained: TrainedAvatar, sizes: Sequence[int], *, repeats: int) -> li
 def inputs(trained: TrainedAvatar, size: int, count: int) -> list[Input]:
     """Held-out frames, spread evenly over the test part, seen `size` pixels wide."""
     recording, test = trained.recording, trained.recording.split.test
-    chosen = evenly_spread(test, count)
+    chosen = [test[i * len(test) // count] for i in range(count)]
     return [(recording.params(i), recording.camera(i, size)) for i in chosen]
 
 
