@@ -240,9 +240,10 @@ def test_masks_may_lie_in_the_folder_that_their_archive_makes(head_dir: Path) ->
 def test_a_region_may_say_it_of_every_vertex(head_dir: Path, kind: type) -> None:
     mask = np.zeros(63, kind)
     mask[[5, 7, 40]] = 1
-    np.savez(head_dir / "masks.npz", lips=mask, face=np.array([1, 0]))
+    np.savez(head_dir / "masks.npz", lips=mask, face=np.array([1, 0]), head=np.arange(63))
     regions = load_head_assets(head_dir).regions
     assert regions["lips"].tolist() == [5, 7, 40] and regions["face"].tolist() == [0, 1]
+    assert regions["head"].tolist() == list(range(63))
 
 
 def test_a_region_of_shares_is_refused(head_dir: Path) -> None:

@@ -109,5 +109,6 @@ def test_a_time_that_the_first_camera_did_not_film_is_seen_by_it_all_the_same(tm
     assert subject.recording.cameras[0].name == "08"
     cameras = subject_drive(subject, None).cameras
     assert cameras is not None and {camera.cx for camera in cameras} == {subject.recording.intrinsics[2]}
+    assert all(torch.equal(one.head_rotation, one.R_cam_world) and one.R_ref_cam is not None for one in cameras)
     for name, poses in (("R", "R_cam_world"), ("t", "t_cam_world")):
         assert torch.equal(torch.stack([getattr(one, poses) for one in cameras]), subject.recording.tracks[name])
