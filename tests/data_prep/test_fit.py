@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
+from heads import grid_head
 
+from avatar.head.model import HeadModel
 from data_prep.prepare.mask_overlap import Mesh, measure_fit, measured_size, share_outside
+from data_prep.prepare.projection import lip_faces
 
 SIZE = (40, 30)
 
@@ -57,3 +63,11 @@ def test_points_on_the_left_and_upper_edge_are_in_the_picture_and_others_are_not
 )
 def test_large_pictures_are_measured_smaller(size: tuple[int, int], measured: tuple[int, int]) -> None:
     assert measured_size(*size) == measured
+
+
+def test_faces_of_the_lips_have_three_vertices_there() -> None:
+    head = HeadModel(grid_head(), torch.zeros(0))
+    assert len(lip_faces(head)) == 0  # a single row
+    rows = HeadModel(replace(grid_head(), regions={"lips": torch.arange(18, 36)}), torch.zeros(0))
+    assert len(lip_faces(rows)) == 16 and set(lip_faces(rows).ravel()) == set(range(18, 36))
+    assert lip_faces(HeadModel(replace(grid_head(), regions={}), torch.zeros(0))).shape == (0, 3)
