@@ -146,6 +146,8 @@ def test_numbers_are_ordered_as_numbers(tmp_path: Path) -> None:
     folder = write_tracked_folder(tmp_path / "subject", frames=12)
     for path in [*(folder / "imgs").iterdir(), *(folder / "parsing").iterdir(), *(folder / "alpha").iterdir()]:
         path.rename(path.with_name(path.name.lstrip("0").replace(".jpg", ".JPG")))
+    for path in (folder / "checkpoint").iterdir():
+        path.rename(path.with_name(f"{int(path.stem)}.frame"))
     subject, _ = prepare_folder(folder, tmp_path / "out")
     assert [f.name for f in subject.manifest.frames] == [str(n) for n in range(1, 13)]
 
