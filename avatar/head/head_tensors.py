@@ -57,7 +57,12 @@ def head_from_tensors(tensors: Mapping[str, Tensor]) -> HeadAssets:
         if tensor.dtype != torch.int64 or (tensor.numel() and not 0 <= int(tensor.min()) <= int(tensor.max()) < limit):
             raise ValueError(f"head.{name} names rows outside of 0 to {limit - 1}")
     parents = tuple(tensors["parents"].tolist())
-    if len(parents) != len(JOINT_NAMES) or parents[0] != -1 or any(not 0 <= p < i for i, p in enumerate(parents) if i):
+    if (
+        tensors["parents"].dtype != torch.int64
+        or len(parents) != len(JOINT_NAMES)
+        or parents[0] != -1
+        or any(not 0 <= p < i for i, p in enumerate(parents) if i)
+    ):
         raise ValueError(f"head.parents is {list(parents)}")
     (method,) = tensors[LAYOUT_TENSOR].tolist() if LAYOUT_TENSOR in tensors else (0,)
     if not isinstance(method, int):

@@ -12,7 +12,7 @@ def sample_image(image: Float[Tensor, "H W C"], screen: Float[Tensor, "N _"], mo
     height, width = image.shape[:2]
     grid = screen[:, :2] * torch.tensor([2 / width, 2 / height]) - 1
     # A point in the camera's plane is not in the image.
-    grid = grid.nan_to_num(nan=-9.0, posinf=9.0, neginf=-9.0).clamp(-9, 9)
+    grid = grid.nan_to_num(nan=-9.0).clamp(-9, 9)
     picked = torch.nn.functional.grid_sample(
         image.permute(2, 0, 1)[None], grid[None, :, None], mode=mode, padding_mode="zeros", align_corners=False
     )

@@ -77,7 +77,8 @@ def _read(table: Table, name: str) -> _Times:
         seconds = [3600.0 * int(m[1] or 0) + 60.0 * int(m[2]) + float(m[3].replace(",", ".")) for m in matches]
         return _Times(_unwrapped(seconds), f"its column {name}", BOUNDS)
     if ":" in cells[0]:
-        wrong = next((i for i, cell in enumerate(cells) if not _TIMECODE.fullmatch(cell)), 0)
+        form = _CLOCK if _CLOCK.fullmatch(cells[0]) else _TIMECODE
+        wrong = next(i for i, cell in enumerate(cells) if not form.fullmatch(cell))
         raise table.wrong(wrong, name, "not a time such as 10:00:00:24 (with frames) or 10:00:00.960")
     values = table.column(name, LATEST)
     match = _NAME.fullmatch(own_name(name))

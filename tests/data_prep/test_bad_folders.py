@@ -76,6 +76,9 @@ def test_a_folder_that_is_something_else_is_not_overwritten(good_folder: Path, t
     with pytest.raises(UserError, match=r"precious exists and is not a prepared subject; choose another --out"):
         prepare_with(good_folder, precious)
     assert (precious / "thesis.tex").read_text() == "years of work"
+    (precious / "thesis.tex").unlink()
+    prepare_with(good_folder, precious)  # an empty folder is as good as none
+    assert (precious / "manifest.json").is_file()
 
 
 @pytest.mark.parametrize("also", ["thesis.tex", ".git"])

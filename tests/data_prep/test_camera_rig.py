@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -223,10 +224,15 @@ def test_a_missing_picture_is_left_out(single: Path, tmp_path: Path) -> None:
     assert any("left out 1 of 18 frames: 00001_12 (" in line for line in said)
 
 
-def test_a_black_camera_is_refused(single: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("has_mattes", [True, False])
+def test_a_black_camera_is_refused(has_mattes: bool, single: Path, tmp_path: Path) -> None:
+    """Black where the person is: around it may be light."""
     folder = edited(single, tmp_path / "copy", lambda _: None)
     for path in folder.glob("images/*_12.png"):
-        assert cv2.imwrite(str(path), np.zeros((56, 64, 3), np.uint8))
+        matte = cv2.imread(str(folder / "fg_masks" / path.name))
+        assert matte is not None and cv2.imwrite(str(path), (255 - matte) * has_mattes)
+    if not has_mattes:
+        shutil.rmtree(folder / "fg_masks")
     with pytest.raises(UserError, match="the pictures of camera 12 are black: 0.0 of 255"):
         opened(folder, tmp_path / "out")
 

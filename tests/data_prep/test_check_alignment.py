@@ -102,6 +102,7 @@ def test_where_the_limits_are(
         ) == found
         assert ("head overlap" in alignment.evidence) == np.isfinite(head)
         assert ("lips overlap" in alignment.evidence) == np.isfinite(lips)
+        assert ("of the head's size away" in alignment.evidence) == np.isfinite([lips, away]).all()
 
 
 @pytest.mark.parametrize("options", [{}, {"frame_offset": 1}], ids=["offset found", "offset given"])

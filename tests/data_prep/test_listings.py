@@ -13,6 +13,8 @@ from importing import import_folder
 
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
+from data_prep.formats.frame_track import BadFrame
+from data_prep.formats.vhap import _static_offset
 
 Edit = Callable[[dict], object]
 
@@ -125,3 +127,21 @@ def test_a_static_offset_of_another_head_is_refused(change: int, tracked: Path, 
     with pytest.raises(UserError, match=counts) as error:
         import_folder(folder, tracked, tmp_path / "out")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        (30, None),
+        (57, None),
+        (27, "has 9 vertices and the head model 10"),
+        (60, "has 20 vertices"),
+        (31, "has 31 values"),
+    ],
+)
+def test_a_static_offset_is_of_the_heads_vertices_and_perhaps_of_teeth(values: int, sentence: str | None) -> None:
+    if sentence is None:
+        assert _static_offset(np.arange(values, dtype=float), 10, "a.npz")[1].tolist() == [3.0, 4.0, 5.0]
+    else:
+        with pytest.raises(BadFrame, match=f"static_offset in a.npz {sentence}"):
+            _static_offset(np.arange(values, dtype=float), 10, "a.npz")

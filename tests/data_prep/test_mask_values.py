@@ -19,6 +19,7 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep.check.folder import Check, check_tracked_folder
+from data_prep.prepare.mask_values import is_coloured
 
 FRAMES = 12
 HEADS, MOUTHS, MATTES = "parsing/*_neckhead.png", "parsing/*_mouth.png", "alpha/*.png"
@@ -56,6 +57,16 @@ def with_palette(folder: Path, pattern: str, palette: tuple[int, ...], label: in
 
 def checked(folder: Path) -> Check:
     return check_tracked_folder(folder, lambda: load_head_assets(folder / "head_model"), frame_offset=1)
+
+
+def test_a_picture_in_colour_is_told_from_a_mask_by_enough_pixels_whose_values_are_its_luminance() -> None:
+    picture = np.full((20, 20, 3), 90, np.uint8)
+    picture[:3, 0] = 200, 90, 30
+    luminance = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    assert is_coloured(picture, luminance) and is_coloured(picture, luminance + np.uint8(16))
+    assert not is_coloured(picture, luminance + np.uint8(17))  # its transparency, or a palette's numbers
+    picture[1:3, 0] = 90
+    assert not is_coloured(picture, cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY))  # 1 of 400 pixels
 
 
 DAVIS = (0, 0, 0, 128, 0, 0)  # black, dark red: a luminance of 38

@@ -150,6 +150,12 @@ def test_hostile_folders_are_refused_in_a_sentence(name: str, copy: Path, tmp_pa
     assert "\n" not in str(error.value) and not (tmp_path / "out").exists()
 
 
+def test_two_scales_agree_by_one_camera(copy: Path, tmp_path: Path) -> None:
+    HOSTILE["two scales"][0](copy)
+    subject, _ = opened(copy, tmp_path / "out", cameras=TRAINED)
+    assert subject.recording.rig is None and len(subject.split.train) > 0
+
+
 def test_a_head_beside_its_mattes_is_refused(copy: Path, tmp_path: Path) -> None:
     edit_tracking(copy, lambda values: values.update(translation=values["translation"] + np.float32([0.15, 0, 0])), TWO)
     with pytest.raises(UserError, match="does not lie on the masks"):

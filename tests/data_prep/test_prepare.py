@@ -125,15 +125,20 @@ def test_without_head_masks_the_matte_is_the_head(tmp_path: Path) -> None:
     assert float((weight - frame.alpha).abs().max()) < 10 / 255, "the matte counts once, not squared"
 
 
-def test_images_that_were_composited_before_are_noticed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("colour", "noticed"), [((255, 255, 255), True), ((255, 252, 250), True), ((252, 250, 248), False)]
+)
+def test_images_that_were_composited_before_are_noticed(
+    colour: tuple[int, int, int], noticed: bool, tmp_path: Path
+) -> None:
     folder = write_tracked_folder(tmp_path / "subject", frames=24, suffix=".png")
     for path in (folder / "imgs").iterdir():
         image = cv2.imread(str(path))
         assert image is not None
-        image[read_mask(folder / "alpha" / path.name) == 0] = 255
+        image[read_mask(folder / "alpha" / path.name) == 0] = colour
         cv2.imwrite(str(path), image)
     _, said = prepare_folder(folder, tmp_path / "out")
-    assert any(s.startswith("note: the images seem to be composited on white already: ") for s in said)
+    assert any(s.startswith("note: the images seem to be composited on white already: ") for s in said) == noticed
 
 
 def test_numbers_are_ordered_as_numbers(tmp_path: Path) -> None:
@@ -141,6 +146,8 @@ def test_numbers_are_ordered_as_numbers(tmp_path: Path) -> None:
     folder = write_tracked_folder(tmp_path / "subject", frames=12)
     for path in [*(folder / "imgs").iterdir(), *(folder / "parsing").iterdir(), *(folder / "alpha").iterdir()]:
         path.rename(path.with_name(path.name.lstrip("0").replace(".jpg", ".JPG")))
+    for path in (folder / "checkpoint").iterdir():
+        path.rename(path.with_name(f"{int(path.stem)}.frame"))
     subject, _ = prepare_folder(folder, tmp_path / "out")
     assert [f.name for f in subject.manifest.frames] == [str(n) for n in range(1, 13)]
 

@@ -83,3 +83,20 @@ def test_a_lens_by_its_angles() -> None:
         pinhole(listed(**{**angles, "camera_angle_y": 4.0}), (64, 48))
     intrinsics, size = pinhole(listed(fl_x=50.0, fl_y=60.0, cx=10.0, cy=20.0, w=128, h=96), (64, 48))
     assert size == (128, 96) and intrinsics.tolist() == [50.0, 60.0, 10.0, 20.0]
+
+
+@pytest.mark.parametrize(("fl_x", "fl_y"), [(0.0, 50.0), (50.0, 0.0), (-1.0, None)])
+def test_both_focal_lengths_have_to_be_positive(fl_x: float, fl_y: float | None) -> None:
+    with pytest.raises(BadFrame, match="the focal lengths fl_x and fl_y are not positive"):
+        pinhole(listed(fl_x=fl_x, fl_y=fl_y), (64, 48))
+
+
+@pytest.mark.parametrize(("side", "is_size"), [(0.9, False), (1, True), (65535, True), (65536, False)])
+def test_sides_of_pictures_are_from_1_to_65535(side: float, is_size: bool) -> None:
+    for w, h in ((side, 48), (64, side)):
+        frame = listed(fl_x=50.0, w=w, h=h)
+        if is_size:
+            assert pinhole(frame, (64, 48))[1] == (w, h)
+        else:
+            with pytest.raises(BadFrame, match="w and h are .*, which no image is"):
+                pinhole(frame, (64, 48))

@@ -18,6 +18,7 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.evaluation import measure as measure_module
 from avatar.evaluation.evaluate import evaluate, notes_of
+from avatar.evaluation.held_out import View
 from avatar.evaluation.protocol import builtin_protocols, choose_protocols
 
 
@@ -40,6 +41,7 @@ def test_bins_intervals_and_worst_frames_are_in_the_results(tmp_path: Path, subj
     results = json.loads(evaluate(run, say=said.append).read_text())
     entry = results["protocols"]["hypergaussians"]
     rows = list(csv.DictReader((run.path / "eval" / "hypergaussians" / "frames.csv").open()))
+    assert not {"by_held_out", "by_camera"} & entry.keys() and not set(View._fields) & rows[0].keys()  # of one camera
     low, high = entry["intervals"]["psnr"]
     figures = [float(row["psnr"]) for row in rows]
     assert min(figures) - 1e-6 <= low < entry["means"]["psnr"] < high <= max(figures) + 1e-6

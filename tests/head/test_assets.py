@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,14 @@ def test_the_objs_faces_may_come_in_another_order(head_dir: Path) -> None:
     order = np.random.default_rng(0).permutation(len(expected))
     (head_dir / "head_template.obj").write_text(obj_text(grid_head(), order))
     np.testing.assert_array_equal(load_head_assets(head_dir).uv_faces, expected)
+
+
+def test_a_triangle_that_is_there_twice_keeps_both_layouts(head_dir: Path) -> None:
+    head = grid_head()
+    faces, corners = torch.cat((head.faces, head.faces[:1])), torch.cat((head.uv_faces, head.uv_faces[-1:]))
+    (head_dir / "head_template.obj").write_text(obj_text(replace(head, faces=faces, uv_faces=corners)))
+    rewrite(head_dir, f=faces.numpy())
+    assert torch.equal(load_head_assets(head_dir).uv_faces, corners)
 
 
 def test_the_objs_words_may_stand_apart_by_tabs(head_dir: Path) -> None:
@@ -240,9 +249,10 @@ def test_masks_may_lie_in_the_folder_that_their_archive_makes(head_dir: Path) ->
 def test_a_region_may_say_it_of_every_vertex(head_dir: Path, kind: type) -> None:
     mask = np.zeros(63, kind)
     mask[[5, 7, 40]] = 1
-    np.savez(head_dir / "masks.npz", lips=mask, face=np.array([1, 0]))
+    np.savez(head_dir / "masks.npz", lips=mask, face=np.array([1, 0]), head=np.arange(63))
     regions = load_head_assets(head_dir).regions
     assert regions["lips"].tolist() == [5, 7, 40] and regions["face"].tolist() == [0, 1]
+    assert regions["head"].tolist() == list(range(63))
 
 
 def test_a_region_of_shares_is_refused(head_dir: Path) -> None:

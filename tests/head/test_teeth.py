@@ -45,6 +45,9 @@ def test_the_rows_lie_behind_the_lips_as_wide_as_the_mouth(assets: HeadAssets) -
         assert 0.012 < float(lips[:, 2].max() - row[:, 2].max()) < 0.018
     meeting = float(rim[:, 1].mean())
     assert float(lower[:, 1].min()) < float(upper[:, 1].min()) < meeting < float(lower[:, 1].max()) < upper[:, 1].max()
+    aside = torch.tensor([-0.5, 0.4, 0.1])
+    moved = with_teeth(replace(assets, template=assets.template + aside)).template
+    torch.testing.assert_close(moved, with_teeth(assets).template + aside, rtol=0, atol=1e-6)
     # Behind the skin at the corners of the mouth, too.
     corner = rim[rim[:, 0].argmax()]
     assert float(upper[upper[:, 0].argmax(), 2]) < float(corner[2]) - 0.005

@@ -105,10 +105,12 @@ def test_every_time_the_same_and_elsewhere_nearly(demo: HeadAssets) -> None:
     eyes = (demo.joint_regressor.double() @ demo.template.double()).numpy()[[3, 4]]
     template, mesh = demo.template.numpy(), demo.faces.numpy()
     first, again, elsewhere = (unwrap(template, mesh, at) for at in (eyes, eyes, eyes.astype(np.float32)))
+    moved = unwrap(template.astype(np.float64) + 1.0, mesh, eyes + 1.0)
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one, other)
-    np.testing.assert_allclose(elsewhere[0], first[0], atol=2e-5)
-    np.testing.assert_array_equal(elsewhere[1], first[1])
+    for uvs, corners in (elsewhere, moved):
+        np.testing.assert_allclose(uvs, first[0], atol=2e-5)
+        np.testing.assert_array_equal(corners, first[1])
 
 
 def test_the_fingerprint_is_that_of_the_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,9 +127,16 @@ def test_the_fingerprint_is_that_of_the_method(tmp_path: Path, monkeypatch: pyte
     assert load_head_assets(tmp_path).fingerprint != made.fingerprint
 
 
-@pytest.mark.parametrize("neck", [0.0, 0.6])
-def test_a_ball_open_or_closed(neck: float) -> None:
-    assert_apart(*unwrap(*ball(neck=neck), EYES))
+@pytest.mark.parametrize(("neck", "lowest"), [(0.0, -0.0609), (0.6, -0.0825)])
+def test_a_ball_open_or_closed(neck: float, lowest: float) -> None:
+    """The cut goes down the middle of the back, to the opening if there is one."""
+    points, faces = ball(neck=neck)
+    uvs, laid = unwrap(points, faces, EYES)
+    assert_apart(uvs, laid)
+    pairs = np.unique(np.stack((laid.ravel(), faces.ravel()), axis=1), axis=0)
+    cut = points[np.flatnonzero(np.bincount(pairs[:, 1]) == 2)]
+    assert np.abs(cut[:, 0]).max() < 1e-9 and cut[:, 2].max() < 0
+    assert (cut[:, 1].max(), cut[:, 1].min()) == pytest.approx((0.0992, lowest), abs=4e-4)
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 5, 9])
@@ -140,6 +149,7 @@ def test_other_parts_lie_in_the_corners(count: int) -> None:
         parts_faces.append(small_faces + len(points) + n * len(small))
     uvs, laid = unwrap(np.concatenate(parts), np.concatenate(parts_faces), EYES)
     assert_apart(uvs, laid)
+    assert (laid[areas(uvs, laid) == 0] == 0).all()  # row 0: triangles without area
     seen = areas(uvs, laid)[len(faces) :].reshape(count, -1)
     assert ((seen > 0).sum(axis=1) > 0.6 * len(small_faces)).all()
     assert covered(uvs, laid) > 0.75

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from camera_rig_folder import opened, write_single
@@ -11,7 +12,7 @@ from heads import random_params, rest_params
 
 from avatar.head.model import matrix_from_6d
 from avatar.motion.drive import Drive, choose_cameras, smoothed, subject_drive
-from avatar.motion.training_distance import FAR, DistanceStrip, distances_csv
+from avatar.motion.training_distance import FAR, GRID, DistanceStrip, distances_csv
 from avatar.types import Camera
 
 
@@ -93,11 +94,15 @@ def test_the_strip_marks_the_frame_and_says_when_it_is_far() -> None:
     assert near.shape == far.shape == (46, 300, 3)
     marks = [(picture == torch.tensor(FAR).numpy()).all(axis=2).sum() for picture in (near, far)]
     assert marks[1] > marks[0], "the mark of a far frame has the colour of far ones"
+    assert (far[:14, 186:] == FAR).all(axis=2).any(), "its figure stands to the right of the words"
+    assert DistanceStrip([0.2], width=300, picture_height=1000).frame(0).shape == (210, 300, 3)
     assert (near[:, :80] != far[:, :80]).any() and (near[:, 150:260] != far[:, 150:260]).any()
 
 
 def test_one_frame_has_a_strip_and_the_csv_has_one_line_per_frame() -> None:
-    assert DistanceStrip([0.0], width=64, picture_height=64).frame(0).shape == (38, 64, 3)
+    strip = DistanceStrip([0.0], width=64, picture_height=64).frame(0)
+    assert strip.shape == (38, 64, 3)
+    assert np.flatnonzero((strip[18] == GRID).all(axis=1)).tolist() == [32], "a line down the middle"
     text = distances_csv(("00007", "00009"), (0.5, 1.25))
     assert text.splitlines() == ["frame,name,distance", "0,00007,0.5000", "1,00009,1.2500"]
 
@@ -109,5 +114,6 @@ def test_a_time_that_the_first_camera_did_not_film_is_seen_by_it_all_the_same(tm
     assert subject.recording.cameras[0].name == "08"
     cameras = subject_drive(subject, None).cameras
     assert cameras is not None and {camera.cx for camera in cameras} == {subject.recording.intrinsics[2]}
+    assert all(torch.equal(one.head_rotation, one.R_cam_world) and one.R_ref_cam is not None for one in cameras)
     for name, poses in (("R", "R_cam_world"), ("t", "t_cam_world")):
         assert torch.equal(torch.stack([getattr(one, poses) for one in cameras]), subject.recording.tracks[name])

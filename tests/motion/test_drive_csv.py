@@ -63,6 +63,7 @@ FORMATS: dict[str, bytes] = {
     "a comma at the end of the lines alone": csv([FIFTY[0], *([*row, ""] for row in FIFTY[1:])]),
     "a comma at the end of the header alone": csv([[*FIFTY[0], ""], *FIFTY[1:]]),
     "empty lines": csv([FIFTY[0], [], *FIFTY[1:], [""] * 6, []]),
+    "empty lines before the names": csv([[], [], *european(FIFTY)], ";"),
     "a byte order mark": b"\xef\xbb\xbf" + csv(FIFTY),
     "UTF-16 of a spreadsheet": csv(FIFTY, "\t").decode().encode("utf-16"),
     "a line that names the separator": b"sep=;\r\n" + csv(european(FIFTY), ";", "\r\n"),
@@ -108,6 +109,14 @@ RATES: dict[str, tuple[Rows, float, str]] = {
         "Timecode",
     ),
     "a clock": (columns("Timecode,JawOpen", [[f"00:00:{i / 25:06.3f}", 0] for i in range(50)]), 25.0, "Timecode"),
+    "a clock that begins with minutes": (
+        columns(
+            "Timecode,JawOpen",
+            [[f"59:{59 + i / 25:06.3f}", 0] for i in range(25)] + [[f"1:00:{i / 25:06.3f}", 0] for i in range(25)],
+        ),
+        25.0,
+        "Timecode",
+    ),
     "time in seconds": (
         columns("frame,time,jawOpen", [[i, f"{i / 30:.6f}", 0] for i in range(50)]),
         30.0,
@@ -172,6 +181,19 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     "times that go back": (csv(times(0, 0.04, 0.08, 0.04)), "line 5: time"),
     "times that stand still": (csv(times(*[0, 0, 0.04, 0.04, 0.08, 0.08])), "line 3: time"),
     "half a timecode": (csv(columns("Timecode,JawOpen", [[code(0), 0], ["later", 0]])), "line 3: Timecode is 'later'"),
+    "half a clock": (
+        csv(columns("Timecode,JawOpen", [["00:00:00.000", 0], ["00:00:00.040", 0], ["later", 0]])),
+        "line 4: Timecode is 'later'",
+    ),
+    "frames beyond those of a second": (
+        csv(
+            columns(
+                "Timecode,JawOpen",
+                [[f"0:0:{s}:{i}", 0] for s, n in ((0, 30), (2, 24), (3, 24), (4, 3)) for i in range(n)],
+            )
+        ),
+        "column Timecode does not tell",
+    ),
     "columns that disagree": (
         csv(columns("time,timestamp_ms,expression_0", [[i / 25, i * 20, 0] for i in range(9)])),
         "columns time and timestamp_ms give 25 and 50",

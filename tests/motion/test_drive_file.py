@@ -52,6 +52,8 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     for a, b in zip(found.cameras, cameras, strict=True):
         assert (a.fx, a.fy, a.cx, a.cy, a.width, a.height) == (200, 210, 63, 50, 128, 96)
         assert torch.equal(a.t_cam_world, b.t_cam_world)
+    with np.load(tmp_path / "d.npz") as file:
+        assert file["K"].tolist() == [[200, 0, 63], [0, 210, 50], [0, 0, 1]] and file["size"].tolist() == [128, 96]
     smaller, _ = read(tmp_path / "d.npz", width=64)
     assert smaller.cameras is not None
     assert (smaller.cameras[0].width, smaller.cameras[0].height, smaller.cameras[0].fx) == (64, 48, 100)
@@ -214,6 +216,11 @@ def test_a_phones_recording_moves_what_the_head_model_names(tmp_path: Path) -> N
     torch.testing.assert_close(right, torch.eye(3))
     assert "1 of ARKit's blendshapes move nothing on this head model: TongueOut" in said
     assert "the head's turns in phone.csv are not used" in said
+
+
+def test_a_coefficients_own_name_beside_arkits_blendshapes_moves_it(tmp_path: Path) -> None:
+    drive, said = read(csv(tmp_path / "phone.csv", "JawOpen,grin,take\n0,0.5,1\n"), ExpressionNames((None, "grin")))
+    assert drive.params[0].expression.tolist() == [0, 0.5, 0, 0, 0] and "left unread in phone.csv: take" in said
 
 
 def test_arkits_weights_beside_the_head_model_win(tmp_path: Path) -> None:

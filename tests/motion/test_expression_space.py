@@ -71,3 +71,10 @@ def test_frames_that_never_move_have_a_space_too() -> None:
     assert space.distances(faces(torch.zeros(1, EXPRESSIONS))).tolist() == [0.0]
     assert float(space.distances(faces(torch.ones(1, EXPRESSIONS)))[0]) > 1.0
     assert space.nearest(faces(torch.ones(1, EXPRESSIONS)))[0].expression.tolist() == [0.0] * EXPRESSIONS
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_few_frames_have_a_space_without_a_nan(seed: int) -> None:
+    points = torch.randn(3, EXPRESSIONS, generator=torch.Generator().manual_seed(seed))
+    space = fit_expressions(faces(points))
+    assert torch.isfinite(space.deviations).all() and float(space.distances(faces(points)).max()) <= 1.001

@@ -37,3 +37,10 @@ def test_limits_are_the_turns_that_training_has_shown() -> None:
 def test_zoom_is_about_the_middle_of_the_picture() -> None:
     near = orbited(replace(FRONT, cx=40), zoom=2.0)
     assert (near.fx, near.fy, near.cx, near.cy) == (160, 160, 48, 28)
+
+
+def test_a_camera_of_a_rig_moves_around_a_head_that_stays() -> None:
+    side = orbited(replace(FRONT, R_ref_cam=orbited(FRONT, 40.0, 5.0).R_cam_world), 10.0)
+    moved = orbited(side, yaw=20.0, pitch=-10.0)
+    torch.testing.assert_close(moved.head_rotation, side.head_rotation, rtol=0, atol=1e-6)
+    assert seen_from(moved).yaw == pytest.approx(-30.0, abs=1.0)

@@ -51,6 +51,7 @@ def test_the_neutral_is_found_and_the_mean_is_not_it() -> None:
     assert (neutral.jaw - rotation_x(3.0)).abs().max() < 0.01
     assert neutral.frame is not None and neutral.frame % 2 == 1
     assert (mean.expression - REST_A).abs().max() > 0.1
+    assert learn_statistics(motion, HEAD, mean).neutral is mean
 
 
 def test_relative_transfer_recovers_the_motion_about_the_targets_own_rest() -> None:
@@ -63,6 +64,7 @@ def test_relative_transfer_recovers_the_motion_about_the_targets_own_rest() -> N
     raw, _, _ = transfer_motion(driver, learned(target), "raw", HEAD)
     raw_error = max(float((m.expression - t.expression).abs().max()) for m, t in zip(raw, target, strict=True))
     assert error < 0.03 and jaw_error < 0.01 and raw_error > 0.4
+    assert all(copied is own for copied, own in zip(raw, driver, strict=True))
 
 
 def test_mean_transfer_moves_mean_to_mean() -> None:
