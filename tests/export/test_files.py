@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import math
 import re
@@ -24,6 +25,8 @@ from avatar.export.bake_texture import bake_texture
 from avatar.export.glb import _end, encode_glb, offsets
 from avatar.export.movie import path_camera
 from avatar.export.ply import FIELDS, encode_ply
+from avatar.export.web_arrays import reduce_avatar
+from avatar.export.web_file import SMALL, quantised
 from avatar.motion.orbit import seen_from
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera
@@ -45,6 +48,15 @@ def trained(
     if request.param == "teeth":
         return lively_avatar(open_mouth_folder, run, "model.teeth=true")
     return lively_avatar(tracked_folder, run)
+
+
+def test_a_page_keeps_the_rotation_of_a_short_quaternion(trained: TrainedAvatar) -> None:
+    avatar = copy.deepcopy(trained.avatar)
+    with torch.no_grad():
+        avatar.quats[:5] *= 1e-5
+    whole, short = (reduce_avatar(replace(trained, avatar=one)).arrays["quats"] for one in (trained.avatar, avatar))
+    np.testing.assert_allclose(short, whole, atol=1e-6)
+    assert quantised(short, *SMALL["quats"])[0].any(axis=1).all()
 
 
 def from_below(camera: Camera) -> Camera:
