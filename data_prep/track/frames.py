@@ -23,6 +23,7 @@ from data_prep.track.mattes.user_mattes import OPAQUE, OwnMattes, share_on
 # JPEG without subsampled colours: its size and error beside PNG are in docs/bench/track_results.md.
 JPEG = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
 WORKERS = 2
+ROUNDING = 1e-3  # seconds by which the times of a picture and of its matte may differ: some files hold milliseconds
 MAX_WITHOUT = 0.1  # of the frames may have a given matte that leaves out the face
 Made = TypeVar("Made")
 Read = Callable[[int], np.ndarray]  # the picture or the mask of the frame with this number
@@ -61,6 +62,8 @@ def write_given_mattes(
     many, and where the mattes are not of all pictures."""
     points = in_view(look.landmarks, view).points
     without = []
+    if span != Span():
+        span = Span(max(0.0, look.between[0] - ROUNDING), look.between[1] + ROUNDING)
     pictures = mattes.read(view, span)
     for number, picture in _chosen(pictures, mattes.footage.path, look, progress, "writing mattes"):
         write_image(mask_file(folder, number), picture.image, [])
