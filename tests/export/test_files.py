@@ -169,6 +169,15 @@ def test_a_mesh_has_the_pose_the_texture_and_the_expressions(trained: TrainedAva
     np.testing.assert_allclose(position, mesh.vertices, atol=1e-6)
 
 
+def test_a_mesh_is_smooth_where_its_texture_is_cut(trained: TrainedAvatar) -> None:
+    tree, buffer = gltf_parts(encode_glb(trained, trained.rest_params(), 16, "")[0])
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    places, normals = (accessor(tree, buffer, attributes[name]) for name in ("POSITION", "NORMAL"))
+    _, first, of = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    assert len(first) < len(places)
+    np.testing.assert_allclose(normals, normals[first[of.ravel()]], atol=1e-6)
+
+
 def test_a_meshs_target_moves_one_joint_and_leaves_the_others(trained: TrainedAvatar) -> None:
     """Whatever the others do in the frame: eyelids add up."""
     params = trained.recording.params(4)
