@@ -65,8 +65,8 @@ def regular_timing(times: Float[np.ndarray, " T"], stated: float | None = None) 
 
 
 def _numbered(places: Float[np.ndarray, " T"]) -> Int[np.ndarray, " T"]:
-    """Each picture's number, counted from the one before: behind a gap that is no whole number of places, all pictures lie
-    halfway between two, and single ones would fall on either."""
+    """Each picture's number, counted from the one before: behind a gap that is no whole number of places all pictures may
+    lie halfway between two, and would fall on either."""
     numbers = np.zeros(len(places), np.int64)
     for n in range(1, len(places)):
         counted = numbers[n - 1] + round(places[n] - places[n - 1])
