@@ -16,6 +16,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from avatar.export.bake_texture import bake_texture
+from avatar.head.normals import vertex_normals
 from avatar.motion.controls import joint_ranges, joint_values, posed
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import HeadParams
@@ -42,6 +43,7 @@ def encode_glb(trained: TrainedAvatar, params: HeadParams, size: int, licence: s
     mesh = trimesh.Trimesh(
         base[of_vertex].numpy(),
         index.reshape(-1, 3).numpy(),
+        vertex_normals=vertex_normals(base, assets.faces)[of_vertex].numpy(),  # the same on both sides of a seam
         visual=TextureVisuals(uv=assets.uvs[of_uv].numpy(), material=material),
         process=False,
     )

@@ -90,7 +90,7 @@ def reduce_avatar(trained: TrainedAvatar) -> WebArrays:
         "grid_weights": empty if grid is None else grid.weights[seen],
         "head_matrix": empty if folded is None else folded.matrix[seen],
         "head_bias": empty if folded is None else folded.bias[seen],
-        "quats": model.quats[seen],
+        "quats": torch.nn.functional.normalize(model.quats[seen], dim=1),  # a short one would be rounded to zero
         "log_scales": model.log_scales[seen],
         "opacity_logits": model.opacity_logits[seen],
         "sh": torch.cat((model.sh_dc, model.sh_rest), dim=1)[seen],

@@ -27,6 +27,8 @@ SHARP = 720  # rows of a picture that is shown large
 CAPTION_SHARE = 0.08  # of the height of the pictures
 MIN_CAPTION = 16  # pixels
 INK, PAPER = (40, 40, 40), 245
+BT709 = ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709")
+"""Tagged: players take what is not for BT.601 or BT.709 by its size."""
 ERROR_SCALE = 0.25  # mean absolute error at which the map is brightest
 
 
@@ -99,7 +101,7 @@ def _start_encoder(
     height, width, channels = shape
     layout = {3: "rgb24", 4: "rgba"}[channels]
     taken = ["-f", "rawvideo", "-pix_fmt", layout, "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
-    made = _codec(path.suffix.lower(), channels == 4, h264)
+    made = [*BT709, *_codec(path.suffix.lower(), channels == 4, h264)]
     if sound is None:
         heard = ["-an"]
     else:

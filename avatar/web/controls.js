@@ -112,7 +112,7 @@ function row(view, text, members, begin) {
   const { group, rest } = members[0], name = members.length > 1 || FIRST[text] ? text : `${group}: ${text}`;
   const label = Object.assign(document.createElement("label"), { className: "row" });
   const input = Object.assign(document.createElement("input"), { type: "range", min: low, max: high, step: "any", value: rest, name });
-  const share = (value) => (high > low ? Math.min(Math.max((value - low) / (high - low), 0), 1) : 0);
+  const share = (value) => Math.min(Math.max((value - low) / (high - low), 0), 1);
   const fill = () => input.style.setProperty("--at", share(input.value));
   input.style.setProperty("--rest", share(rest));
   input.setAttribute("aria-label", name);

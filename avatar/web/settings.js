@@ -6,9 +6,9 @@ const COUNTS = { jaw: 3, gaze: 3, neck: 3, lids: 2, head: 2 }; // numbers of eac
 
 export class Settings {
   #header;
-  #pinned = new Map(); // parameter index -> value
+  #expression = new Map(); // coefficient's index or control -> value; the last one wins
+  #pinned = new Map(); // index of another parameter -> value
   #turns = new Map(); // first index of a rotation -> its vector
-  #controls = new Map(); // control -> value
   turned = [0, 0]; // of the head: yaw and pitch in degrees
 
   constructor(header) {
@@ -18,13 +18,16 @@ export class Settings {
   /** Coefficients by name or number, or controls as "Group: name"; null lets go. Returns the names that are unknown. */
   setExpression(values) {
     const { controls, expressions, sizes } = this.#header, unknown = [];
-    const put = (map, key, value) => (value === null ? map.delete(key) : map.set(key, value));
+    const put = (key, value) => {
+      this.#expression.delete(key);
+      if (value !== null) this.#expression.set(key, value);
+    };
     for (const [key, value] of Object.entries(values)) {
       const control = controls.find((c) => `${c.group}: ${c.name}` === key);
       const index = /^\d+$/.test(key) ? Number(key) : expressions.indexOf(key);
       if (value !== null && !Number.isFinite(value)) unknown.push(key);
-      else if (control) put(this.#controls, control, value);
-      else if (index >= 0 && index < sizes.expressions) put(this.#pinned, index, value);
+      else if (control) put(control, value);
+      else if (index >= 0 && index < sizes.expressions) put(index, value);
       else unknown.push(key);
     }
     return unknown;
@@ -53,26 +56,27 @@ export class Settings {
 
   /** Throws AvatarError for another number of parameters. */
   setParameters(values) {
-    const count = this.#header.rest.length;
+    const count = this.#header.rest.length, E = this.#header.sizes.expressions;
     if (values && (values.length !== count || !Array.from(values).every(Number.isFinite)))
       throw new AvatarError(`This avatar takes ${count} parameters, all of them numbers.`);
     this.release();
-    if (values) values.forEach((value, i) => this.#pinned.set(i, value));
+    if (values) Array.from(values, (value, i) => (i < E ? this.#expression : this.#pinned).set(i, value));
   }
 
   release() {
-    this.#pinned.clear();
-    this.#turns.clear();
-    this.#controls.clear();
+    for (const set of [this.#expression, this.#pinned, this.#turns]) set.clear();
     this.turned = [0, 0];
   }
 
   /** Change parameters in place to what is set. */
   apply(parameters) {
     const { rest } = this.#header;
-    const far = ({ values }) => values.reduce((sum, value, i) => sum + value * (parameters[i] - rest[i]), 0);
-    const moves = [...this.#controls].map(([control, share]) => [control.values, share - far(control)]);
-    for (const [values, more] of moves) values.forEach((value, i) => (parameters[i] += more * value));
+    const far = (values) => values.reduce((sum, value, i) => sum + value * (parameters[i] - rest[i]), 0);
+    for (const [key, value] of this.#expression) {
+      const { values } = key, more = values && value - far(values);
+      if (values) values.forEach((share, i) => (parameters[i] += more * share));
+      else parameters[key] = value;
+    }
     for (const [start, vector] of this.#turns) {
       const own = vector.includes(null) ? rotationVector(parameters.subarray(start, start + 6)) : vector;
       parameters.set(sixD(rotation(vector.map((value, i) => value ?? own[i]))), start);

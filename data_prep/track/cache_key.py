@@ -13,7 +13,7 @@ from data_prep.track.footage.source import Footage
 from data_prep.track.mattes.segmentation_network import matte_network
 from data_prep.track.stage_folder import hash_of
 
-STAGES_VERSION = 18  # raised when what a stage makes changes
+STAGES_VERSION = 19  # raised when what a stage makes changes
 
 
 def tracking_key(footage: Footage, choices: dict[str, Any], head_path: Path, head: HeadAssets) -> str:

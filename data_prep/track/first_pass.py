@@ -36,6 +36,7 @@ class FirstPass:
     is_whole: bool  # whether these were all between --start and --end
     notes: list[str]
     begins: float = 0.0  # seconds into the video, of frame 0
+    between: tuple[float, float] = (0.0, 0.0)  # likewise, of the first picture that was read and of the last
 
 
 def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
@@ -134,7 +135,8 @@ def _on_grid(
         )
     size = footage.width, footage.height
     landmarks = Landmarks(points, scores, detected, size, timing.fps)
-    return FirstPass(landmarks, pictures, len(times), is_whole, notes, float(own[0]))
+    between = float(times[0]), float(times[-1])
+    return FirstPass(landmarks, pictures, len(times), is_whole, notes, float(own[0]), between)
 
 
 def _too_long(footage: Footage, first: float, last: float) -> str:
@@ -157,9 +159,11 @@ def to_json(look: FirstPass) -> dict[str, Any]:
         "is_whole": look.is_whole,
         "notes": look.notes,
         "begins": look.begins,
+        "between": look.between,
     }
 
 
 def from_json(raw: dict[str, Any], landmarks: Landmarks) -> FirstPass:
     pictures = np.array(raw["pictures"], np.int64)
-    return FirstPass(landmarks, pictures, raw["read"], raw["is_whole"], list(raw["notes"]), raw["begins"])
+    known = raw["read"], raw["is_whole"], list(raw["notes"]), raw["begins"], tuple(raw["between"])
+    return FirstPass(landmarks, pictures, *known)

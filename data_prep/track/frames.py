@@ -21,6 +21,7 @@ from data_prep.track.mattes.despill import despilled
 from data_prep.track.mattes.user_mattes import OPAQUE, OwnMattes, share_on
 
 WORKERS = 2
+ROUNDING = 1e-3  # seconds by which the times of a picture and of its matte may differ: some files hold milliseconds
 MAX_WITHOUT = 0.1  # of the frames may have a given matte that leaves out the face
 Made = TypeVar("Made")
 Read = Callable[[int], np.ndarray]  # the picture or the mask of the frame with this number
@@ -59,6 +60,8 @@ def write_given_mattes(
     many, and where the mattes are not of all pictures."""
     points = in_view(look.landmarks, view).points
     without = []
+    if span != Span():
+        span = Span(max(0.0, look.between[0] - ROUNDING), look.between[1] + ROUNDING)
     pictures = mattes.read(view, span)
     for number, picture in _chosen(pictures, mattes.footage.path, look, progress, "writing mattes"):
         write_image(mask_file(folder, number), picture.image)

@@ -71,12 +71,15 @@ class Quality:
 
 
 def grade_tracking(
-    landmarks: Landmarks, fit: Fit, overlaps: Sequence[float], outline: Outline | None, focal: Focal
+    landmarks: Landmarks, pictures: int, fit: Fit, overlaps: Sequence[float], outline: Outline | None, focal: Focal
 ) -> Quality:
-    """The figures of a finished tracking. `fit.figures` holds what `landmark_figures` made of it."""
+    """The figures of a finished tracking of so many pictures: the video need not have one at every time.
+
+    `fit.figures` holds what `landmark_figures` made of it.
+    """
     own = fit.figures
     shots = {name: float(value) for name, value in own["errors"].items()}
-    seen = float(landmarks.detected.mean())
+    seen = float(landmarks.detected.sum() / pictures)
     figures = [
         Figure("frames with a face", 100 * seen, "%", 99, 90, "light the face, and keep it in the picture", True),
         Figure("face inside the picture", 100 * own["inside"], "%", 99, 95, "leave more room around the head", True),

@@ -123,7 +123,7 @@ def track(
         overlaps, outline = work.masks(landmarks, fit)
         fit = work.torso(fit)
         work.overlay(fit, look)
-        quality = grade_tracking(landmarks, fit, overlaps, outline, focal)
+        quality = grade_tracking(landmarks, int((look.pictures >= 0).sum()), fit, overlaps, outline, focal)
         for line in quality.lines():
             say(line)
         save_landmarks(stages.path / LANDMARKS_FILE, landmarks)

@@ -35,6 +35,8 @@ console.log(JSON.stringify({
   nothing: after(),
   wide: after((s) => s.setExpression({ "Mouth: wide": 0 })),
   both: after((s) => s.setExpression({ "Mouth: wide": 2, "Brows: up": -1 })),
+  controlLast: after((s) => s.setParameters(rest), (s) => s.setExpression({ "Mouth: wide": 2 })),
+  coefficientLast: after((s) => s.setExpression({ "Mouth: wide": 2, c: 7 }), (s) => s.setExpression({ a: 4 })),
   gaze: after(gaze),
   lid: after((s) => s.setPose({ lids: [0.5, null] })),
   released: after(gaze, (s) => s.setPose({ gaze: null })),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import math
 import re
@@ -24,6 +25,8 @@ from avatar.export.bake_texture import bake_texture
 from avatar.export.glb import _end, encode_glb, offsets
 from avatar.export.movie import path_camera
 from avatar.export.ply import FIELDS, encode_ply
+from avatar.export.web_arrays import reduce_avatar
+from avatar.export.web_file import SMALL, quantised
 from avatar.motion.orbit import seen_from
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.types import Camera
@@ -45,6 +48,15 @@ def trained(
     if request.param == "teeth":
         return lively_avatar(open_mouth_folder, run, "model.teeth=true")
     return lively_avatar(tracked_folder, run)
+
+
+def test_a_page_keeps_the_rotation_of_a_short_quaternion(trained: TrainedAvatar) -> None:
+    avatar = copy.deepcopy(trained.avatar)
+    with torch.no_grad():
+        avatar.quats[:5] *= 1e-5
+    whole, short = (reduce_avatar(replace(trained, avatar=one)).arrays["quats"] for one in (trained.avatar, avatar))
+    np.testing.assert_allclose(short, whole, atol=1e-6)
+    assert quantised(short, *SMALL["quats"])[0].any(axis=1).all()
 
 
 def from_below(camera: Camera) -> Camera:
@@ -155,6 +167,15 @@ def test_a_mesh_has_the_pose_the_texture_and_the_expressions(trained: TrainedAva
     position = accessor(tree, buffer, gltf_mesh["primitives"][0]["attributes"]["POSITION"])
     assert position.shape == lid.shape
     np.testing.assert_allclose(position, mesh.vertices, atol=1e-6)
+
+
+def test_a_mesh_is_smooth_where_its_texture_is_cut(trained: TrainedAvatar) -> None:
+    tree, buffer = gltf_parts(encode_glb(trained, trained.rest_params(), 16, "")[0])
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    places, normals = (accessor(tree, buffer, attributes[name]) for name in ("POSITION", "NORMAL"))
+    _, first, of = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    assert len(first) < len(places)
+    np.testing.assert_allclose(normals, normals[first[of.ravel()]], atol=1e-6)
 
 
 def test_a_meshs_target_moves_one_joint_and_leaves_the_others(trained: TrainedAvatar) -> None:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from browsers import WEB
 from pages import shown, until
 
+from avatar.data.split import Split
 from avatar.export import default_view
 from avatar.export.default_view import front_camera, neck_fade, neck_heights
+from avatar.export.glb import NOTABLE
+from avatar.export.web_page import write_page
 from avatar.runs.trained_avatar import TrainedAvatar
 
 CHANGED = "(name) => Math.abs(document.querySelector(`input[name='${name}']`).value - 0)"
@@ -30,6 +36,11 @@ def test_it_opens_idle_from_the_front_on_a_stage_of_the_theme(visit: Any, traine
     assert turn == pytest.approx(front_camera(trained).R_cam_world.flatten().tolist())
     page.emulate_media(color_scheme="light")
     until(page, "avatar.background[0] > 0.9")
+
+
+def test_a_page_and_a_mesh_have_the_same_idea_of_what_training_has_hardly_shown() -> None:
+    found = re.search(r"const NOTABLE = ([0-9.]+);", (WEB / "controls.js").read_text())
+    assert found is not None and float(found[1]) == NOTABLE
 
 
 def test_the_head_is_upright_in_the_middle(trained: TrainedAvatar) -> None:
@@ -148,6 +159,21 @@ def test_sliders_and_time_follow_the_motion(visit: Any) -> None:
     assert float(slider.input_value()) == pytest.approx(jaw, abs=0.01 * extent)
     still = visit("&autoplay", reduced_motion="reduce")
     assert not still.evaluate("avatar.isPlaying"), "who wants stillness has it"
+
+
+@pytest.mark.chromium
+def test_a_motion_of_one_frame_plays(browser: Any, trained: TrainedAvatar, tmp_path: Path) -> None:
+    train, test = trained.recording.split
+    recording = replace(trained.recording, split=Split(train, test[:1]))
+    page = browser.new_page()
+    page.goto(
+        write_page(replace(trained, recording=recording), tmp_path / "a.html").path.as_uri() + "?autoplay&width=64"
+    )
+    until(page, "avatar.isPlaying && document.getElementById('time').textContent === '0:00 / 0:00'")
+    scrub = "document.getElementById('scrub')"
+    assert page.evaluate(f"[avatar.frameCount, avatar.time, {scrub}.max, {scrub}.value]") == [1, 0, "0", "0"]
+    assert page.evaluate(f"{scrub}.style.getPropertyValue('--at')") == "0"
+    page.close()
 
 
 @pytest.mark.chromium

@@ -31,6 +31,12 @@ def test_a_control_moves_the_expression_along_its_direction_only(faces: dict[str
     }
 
 
+def test_of_a_control_and_a_coefficient_the_last_wins(faces: dict[str, Any]) -> None:
+    assert faces["controlLast"]["expression"] == pytest.approx([0.5 + 2 * 0.6, -1 + 2 * 0.8, 2], abs=1e-6)
+    wide = 2 - 1.1  # from where the face is
+    assert faces["coefficientLast"]["expression"] == pytest.approx([4, wide * 0.8, 7], abs=1e-6)
+
+
 def test_one_number_of_a_gaze_leaves_the_others_to_the_motion(faces: dict[str, Any]) -> None:
     moved = changed(faces, "gaze")
     assert moved == {side: pytest.approx([0.1, 0.2, 0], abs=1e-6) for side in ("left", "right")}

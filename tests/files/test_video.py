@@ -12,6 +12,8 @@ import torch
 
 from avatar.errors import UserError
 from avatar.files.video import ERROR_SCALE, error_map, side_by_side, write_video
+from data_prep.track.footage.source import Span, whole
+from data_prep.track.footage.video import open_video
 
 
 def gradients(count: int, height: int, width: int) -> Iterator[np.ndarray]:
@@ -34,6 +36,16 @@ def test_reads_back_in_order_size_and_rate(tmp_path: Path, height: int, width: i
         error = np.abs(frame[:height, :width].astype(int) - truth)
         assert error.mean() < 3.0  # of 255: chroma is stored at half the resolution
     assert [p.name for p in path.parent.iterdir()] == ["clip.mp4"]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".webm"])
+def test_a_video_says_by_which_matrix_its_colours_are_made(tmp_path: Path, suffix: str) -> None:
+    """Players take a video without a tag for BT.601 or BT.709 by its size."""
+    write_video(tmp_path / f"a{suffix}", [np.full((64, 80, 3), (40, 60, 220), np.uint8)] * 2, fps=25)
+    video = open_video(tmp_path / f"a{suffix}")
+    assert video.colour[1] == "bt709"
+    picture = next(video.read(whole(80, 64), Span(), str))
+    assert np.abs(picture.image.astype(int) - (40, 60, 220)).max() <= 2
 
 
 def test_a_failure_on_the_way_leaves_the_old_file_and_no_part(tmp_path: Path) -> None:

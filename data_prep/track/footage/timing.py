@@ -12,6 +12,7 @@ COMMON_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 15.0, 12.5, 12.0, 
 _SNAP = 0.005  # relative: what time stamps in whole milliseconds do to a regular rate
 _SNAP_VARIABLE = 0.02
 _DRIFT = 0.25  # pictures at the end, by which a usual rate may be off: with more it is another one
+_SLACK = 0.75  # places by which a picture may be off its number
 _REGULAR = (0.5, 1.5)  # times the median distance, within which pictures are taken one by one
 
 
@@ -48,7 +49,7 @@ def regular_timing(times: Float[np.ndarray, " T"], stated: float | None = None) 
         usual = np.sort(forward)[len(forward) // 2 - 1 :][:1]
     fps = _common(float(1.0 / usual.mean()), _SNAP_VARIABLE)
     places = np.maximum.accumulate(times - times[0]) * fps  # a time that runs backwards stays where it was
-    numbers = np.rint(places).astype(np.int64)
+    numbers = _numbered(places)
     off = np.abs(places - numbers)
     starts = np.flatnonzero(np.r_[True, numbers[1:] != numbers[:-1]])
     for first, end in zip(starts, np.r_[starts[1:], T], strict=True):
@@ -61,6 +62,16 @@ def regular_timing(times: Float[np.ndarray, " T"], stated: float | None = None) 
         f"clip is taken at {fps:.4g} a second, {dropped} pictures between are left out and {empty} times have none"
     )
     return Timing(fps, numbers, (note,))
+
+
+def _numbered(places: Float[np.ndarray, " T"]) -> Int[np.ndarray, " T"]:
+    """Each picture's number, counted from the one before: behind a gap that is no whole number of places all pictures may
+    lie halfway between two, and would fall on either."""
+    numbers = np.zeros(len(places), np.int64)
+    for n in range(1, len(places)):
+        counted = numbers[n - 1] + round(places[n] - places[n - 1])
+        numbers[n] = counted if abs(places[n] - counted) <= _SLACK else round(places[n])
+    return numbers
 
 
 def _common(fps: float, tolerance: float = _SNAP) -> float:

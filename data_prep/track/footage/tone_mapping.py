@@ -11,8 +11,15 @@ HDR_TRANSFERS = {"smpte2084": "PQ", "arib-std-b67": "HLG"}
 _NOMINAL_PEAK = 100  # candela per square metre that become white before the shoulder of the curve
 
 
-def tone_filters(colour: tuple[str, ...], pixel_format: str, height: int) -> list[str]:
-    """After the scaling, before the last `format`. `colour` is ffmpeg's (range, matrix, primaries, transfer).
+def assumed_matrix(colour: tuple[str, ...], pixel_format: str, height: int) -> list[str]:
+    """Before the scaling, which makes RGB; `colour` is ffmpeg's (range, matrix, primaries, transfer)."""
+    if colour[1] == "unknown" and height >= 720 and not pixel_format.startswith(("rgb", "bgr", "gbr", "pal", "gray")):
+        return ["setparams=colorspace=bt709"]  # what players take for untagged high definition
+    return []
+
+
+def tone_filters(colour: tuple[str, ...]) -> list[str]:
+    """After the scaling, before the last `format`.
 
     PQ (SMPTE ST 2084) and HLG (ITU-R BT.2100) are made linear, brought to BT.709's primaries and compressed by Hable's
     curve with zimg. An ffmpeg without zimg gives the picture as if it were not HDR: right in shape, flat in colour.
@@ -28,8 +35,6 @@ def tone_filters(colour: tuple[str, ...], pixel_format: str, height: int) -> lis
             "zscale=t=bt709:m=bt709:r=tv",
             "format=yuv444p",
         ]
-    if matrix == "unknown" and height >= 720 and not pixel_format.startswith(("rgb", "bgr", "gbr", "pal", "gray")):
-        return ["setparams=colorspace=bt709"]  # what players take for untagged high definition
     return []
 
 

@@ -23,7 +23,7 @@ from data_prep.track.footage.source import (
     opaque,
     stride,
 )
-from data_prep.track.footage.tone_mapping import HDR_TRANSFERS, tone_filters
+from data_prep.track.footage.tone_mapping import HDR_TRANSFERS, assumed_matrix, tone_filters
 
 _INPUT = re.compile(r"Input #0, (\S+), from")
 _STREAM = re.compile(r"Stream #0:(\d+)(?:\[0x[0-9a-f]+\])?(?:\(\w+\))?: (\w+): (.*)")
@@ -52,13 +52,14 @@ class Video(Footage):
         is_transparent = bool(_TRANSPARENT.match(self.first.pixel_format)) or bool(self.decoder)
         # Without a known length the file may have no index to seek by; then the pictures before are decoded and left.
         can_seek = self.duration is not None and span.start > 0
+        matrix = assumed_matrix(self.colour, self.first.pixel_format, self.height)
         decoder = Decoder(
             self.path,
             self.stream,
             view.width,
             view.height,
             before=["bwdif=mode=send_frame:deint=interlaced"] if self.first.is_interlaced else [],
-            filters=[*self._geometry(view), *tone_filters(self.colour, self.first.pixel_format, self.height)],
+            filters=[*matrix, *self._geometry(view), *tone_filters(self.colour)],
             channels=4 if is_transparent else 3,
             seek=[*(("-ss", f"{span.start:.6f}") if can_seek else ()), *self.decoder],
         )

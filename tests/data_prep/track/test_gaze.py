@@ -96,7 +96,9 @@ def test_the_table_tells_of_irises_that_do_not_follow(looked: Looked) -> None:
     def grades(landmarks: Landmarks, motion: Motion = fit.motion) -> list[str | None]:
         tracks = as_tracks(fit, motion, scene.camera, landmarks.size, scene.assets.num_expressions)
         figures = landmark_figures(scene.assets, Fit(tracks, {}), landmarks, scene.embedding)
-        quality = grade_tracking(landmarks, Fit(tracks, figures), [1.0], None, Focal(1.0, "given", False))
+        quality = grade_tracking(
+            landmarks, len(landmarks), Fit(tracks, figures), [1.0], None, Focal(1.0, "given", False)
+        )
         return [figure.grade for figure in quality.figures if "irises" in figure.name]
 
     assert grades(scene.landmarks) == ["good"]

@@ -13,8 +13,9 @@ from data_prep.track import quality
 from data_prep.track.faces.embedding import LandmarkEmbedding
 from data_prep.track.faces.landmark_groups import LEFT_IRIS, LIPS, NOSE
 from data_prep.track.faces.landmarks import BLENDSHAPES, NUM_POINTS, Landmarks
+from data_prep.track.fit.focal import Focal
 from data_prep.track.fit.result import Fit
-from data_prep.track.quality import Figure, Quality, landmark_figures
+from data_prep.track.quality import Figure, Quality, grade_tracking, landmark_figures
 
 
 @pytest.mark.parametrize(
@@ -37,6 +38,17 @@ def test_figures_without_bounds_are_told_only() -> None:
     figure = Figure("texture", 31.5, "dB")
     assert figure.grade is None and figure.to_json() == {"name": "texture", "value": 31.5, "unit": "dB"}
     assert figure.line().split() == ["texture", "31.500", "dB"]
+
+
+def test_times_without_a_picture_are_no_frames_without_a_face() -> None:
+    T, detected = 20, np.arange(20) % 4 != 0
+    points, scores = np.zeros((T, NUM_POINTS, 3), np.float32), np.zeros((T, len(BLENDSHAPES)), np.float32)
+    seen = Landmarks(points, scores, detected, (64, 64), 25.0)
+    figures = {"errors": {"all": 1.0}, "inside": 1.0, "constant": 0.0, "irises": None, "jitter": 1.0, "identity": 0.0}
+    fit = Fit({n: track() for n in np.flatnonzero(detected).tolist()}, figures | {"worst_frames": []})
+    for pictures, share, grade in ((15, 100.0, "good"), (20, 75.0, "poor")):
+        first = grade_tracking(seen, pictures, fit, [1.0], None, Focal(1.0, "given", False)).figures[0]
+        assert (first.value, first.grade) == (share, grade)
 
 
 def test_errors_are_what_changes_from_frame_to_frame(monkeypatch: pytest.MonkeyPatch) -> None:

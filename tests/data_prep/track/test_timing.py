@@ -53,6 +53,19 @@ def test_a_variable_rate_leaves_gaps_and_drops_between() -> None:
     )
 
 
+@pytest.mark.parametrize("digits", [6, 3])
+@pytest.mark.parametrize("gap", [1.7, 2.4, 2.5, 3.5])
+def test_a_gap_that_is_no_whole_number_of_pictures_loses_none_behind_it(gap: float, digits: int) -> None:
+    rng = np.random.default_rng(0)
+    times = (np.arange(200) + rng.uniform(-0.2, 0.2, 200)) / 30
+    times[100:] += gap / 30
+    timing = regular_timing(np.round(times, digits), 30.0)
+    assert (
+        timing.fps == 30.0 and (np.diff(timing.numbers[:100]) == 1).all() and (np.diff(timing.numbers[100:]) == 1).all()
+    )
+    assert np.abs(timing.numbers - (times - times[0]) * 30).max() < 1
+
+
 def test_two_distances_that_are_as_common_lose_no_picture() -> None:
     times = np.cumsum([0, *(1 / 30, 4 / 30) * 10])
     timing = regular_timing(times)

@@ -251,6 +251,18 @@ def test_mattes_of_a_part_are_of_its_own_pictures(kind: str, tmp_path: Path) -> 
             assert "begin at 0.00 s of their file and the video's pictures at 0.08 s" in " ".join(mattes.notes)
 
 
+def test_times_that_a_file_rounds_do_not_shift_the_mattes_of_a_part(tmp_path: Path) -> None:
+    video = encode(tmp_path / "v.mov", [picture(n % 5) for n in range(18)], fps=30, options=LOSSLESS)
+    mattes = encode(tmp_path / "m.mkv", [np.dstack([matte(n % 5)] * 3) for n in range(18)], fps=30, options=LOSSLESS)
+    for part in (Span(0.1668, 0.5668), Span(0.1668)):  # behind the sixth picture; before its Matroska milliseconds
+        out = tmp_path / f"{part.end}"
+        (tmp_path / "head.npz").touch()
+        choices = Choices(crop="none", matte=mattes, span=part)
+        track(video, out, tmp_path / "head.npz", grid_head(), choices, say=lambda _: None)
+        found = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted((out / "matte").iterdir())]
+        np.testing.assert_array_equal(found, [matte(n % 5) for n in range(6, 18)])
+
+
 def test_single_mattes_without_the_face_are_named_and_many_refused(video: Path, tmp_path: Path) -> None:
     def without(*numbers: int) -> Write:
         return lambda path, m: cv2.imwrite(str(path), m * 0 if int(path.stem) in numbers else m)

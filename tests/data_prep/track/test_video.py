@@ -58,11 +58,16 @@ def test_colours_survive(tmp_path: Path) -> None:
     encode(tmp_path / "a.mkv", still(2), options=LOSSLESS)
     pictures, _ = read(tmp_path / "a.mkv")
     np.testing.assert_array_equal(pictures[1].image, still()[0])
-    # High definition without a tag is BT.709, as players take it.
-    encode(tmp_path / "b.mp4", [np.full((720, 64, 3), (180, 60, 40), np.uint8)] * 2,
-           options=("-vf", "scale=out_color_matrix=bt709", *X264))  # fmt: skip
-    pictures, _ = read(tmp_path / "b.mp4")
-    assert np.abs(pictures[0].image.astype(int) - (180, 60, 40)).max() <= 3
+
+
+@pytest.mark.parametrize(("height", "matrix"), [(720, "bt709"), (480, "smpte170m")])
+def test_a_video_without_a_tag_has_the_colours_that_players_show(tmp_path: Path, height: int, matrix: str) -> None:
+    made = f"scale=out_color_matrix={matrix},format=yuv420p,setparams=colorspace=unknown"
+    encode(tmp_path / "a.mp4", [np.full((height, 64, 3), (180, 60, 40), np.uint8)] * 2, options=("-vf", made, *X264))
+    assert open_video(tmp_path / "a.mp4").colour[1] == "unknown"
+    for view in (None, View(Box(4, 4, 56, 56), 28, 28)):
+        pictures, _ = read(tmp_path / "a.mp4", view)
+        assert np.abs(pictures[0].image.astype(int) - (180, 60, 40)).max() <= 3
 
 
 def test_rotation_in_the_metadata_is_applied_and_said(tmp_path: Path) -> None:
