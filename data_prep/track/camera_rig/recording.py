@@ -28,7 +28,7 @@ from data_prep.formats.nersemble_cameras import CALIBRATION, read_calibration, r
 from data_prep.track.footage.colour_corrected import TERMS, colour_corrected
 from data_prep.track.footage.joined import join
 from data_prep.track.footage.source import Footage, stride
-from data_prep.track.footage.video import open_video
+from data_prep.track.footage.video import Video, open_video
 
 COLOURS = CALIBRATION.with_name("color_calibration.json")
 NOMINAL_RATE = 25.0
@@ -70,7 +70,7 @@ def open_recording(folder: Path) -> Recording:
         )
     unused = without_pictures(set(videos), read_serials(person), person / CALIBRATION)
     matrices = read_colour_matrices(person, videos)
-    footage: dict[str, Footage] = {serial: open_video(path) for serial, path in videos.items()}
+    footage: dict[str, Footage] = {serial: as_converted(open_video(path)) for serial, path in videos.items()}
     counts = {serial: count_pictures(path, "v:0") for serial, path in videos.items()}
     refuse_lengths({videos[serial]: count for serial, count in counts.items()})
     calibrated = read_cameras(person, {serial: (one.width, one.height) for serial, one in footage.items()})
@@ -78,6 +78,12 @@ def open_recording(folder: Path) -> Recording:
         footage[serial] = colour_corrected(footage[serial], matrix, person / COLOURS)
     cameras = {serial: Camera(footage[serial], *calibrated[serial][:3]) for serial in videos}
     return Recording(folder, cameras, TRAINED_CAMERA if TRAINED_CAMERA in cameras else None, unused)
+
+
+def as_converted(video: Video) -> Video:
+    """The same, by BT.601 where its colours have no tag, whatever its size: ffmpeg makes pictures into a video so."""
+    pixels, matrix, *others = video.colour
+    return replace(video, colour=(pixels, "smpte170m" if matrix == "unknown" else matrix, *others))
 
 
 def read_colour_matrices(person: Path, serials: Iterable[str]) -> dict[str, np.ndarray]:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from rig_recording import FILMED, write_plain_raw
+from videos import encode
 
 from avatar.cli import main
 from avatar.errors import UserError
@@ -41,6 +42,15 @@ def test_nersemble(raw: Path, tmp_path: Path) -> None:
     assert track_rig.recognise(raw) and not track_rig.recognise(raw.parent)
     same(recording.open_recording(raw))
     assert recording.open_recording(raw).front == "222200037"
+
+
+def test_colours_of_large_videos_without_a_tag_are_those_of_the_pictures(raw: Path, tmp_path: Path) -> None:
+    folder = changed(raw, tmp_path, lambda _: None)
+    for path in folder.rglob("cam_*.mp4"):
+        encode(path, [np.full((720, 720, 3), (180, 60, 40), np.uint8)] * 2)
+    for camera in recording.open_recording(folder).cameras.values():
+        picture = next(camera.footage.read(whole(720, 720), Span(), lambda _: None))
+        assert np.abs(picture.image.astype(int) - (180, 60, 40)).max() <= 3
 
 
 def test_nersemble_with_one_lens_for_all(raw: Path, tmp_path: Path) -> None:
