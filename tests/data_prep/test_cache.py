@@ -10,8 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from preparing import prepare_folder
+from preparing import edit, prepare_folder
 from tracked_folder import write_tracked_folder
 
 from avatar.data.manifest import read_manifest
@@ -103,12 +104,14 @@ def test_several_at_once_all_succeed(offsets: tuple[int, int], tmp_path: Path) -
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "subject"]
 
 
-def test_the_data_hash_does_not_depend_on_the_place(tmp_path: Path) -> None:
+def test_the_data_hash_is_of_the_tracking_and_does_not_depend_on_the_place(tmp_path: Path) -> None:
     a = write_tracked_folder(tmp_path / "a" / "one", frames=12)
     shutil.copytree(a, tmp_path / "b" / "two")
     first, _ = prepare_folder(a, tmp_path / "out1")
     second, _ = prepare_folder(tmp_path / "b" / "two", tmp_path / "out2")
     assert first.data_hash == second.data_hash and first.manifest.input_hash != second.manifest.input_hash
+    edit(a / "checkpoint" / "00003.frame", "flame", eyelids=np.full((1, 2), 0.25, np.float32))
+    assert prepare_folder(a, tmp_path / "out3")[0].data_hash != first.data_hash
 
 
 def flip(path: Path, at: int) -> None:

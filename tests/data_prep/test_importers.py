@@ -63,7 +63,12 @@ def test_the_frontal_one_of_several_cameras_is_used(tracked: Path, original: Sub
     aside = np.array(listing["frames"][0]["transform_matrix"])
     aside[:3, :3] = cv2.Rodrigues(np.array([0, 1.2, 0]))[0] @ aside[:3, :3]
     listing["frames"] += [
-        entry | {"camera_id": "aside", "transform_matrix": aside.tolist(), "file_path": f"images/{i:05d}_01.png"}
+        entry
+        | {
+            "camera_id": "aside",
+            "transform_matrix": aside.tolist(),
+            "file_path": f"images/{i:05d}_00.jpg",
+        }  # comes first
         for i, entry in enumerate(listing["frames"])
     ]
     (folder / "transforms.json").write_text(json.dumps(listing))

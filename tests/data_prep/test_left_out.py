@@ -16,6 +16,8 @@ from avatar.cli import main
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep.check.folder import check_tracked_folder
+from data_prep.formats.frame_files import FrameFiles
+from data_prep.prepare.pairing import TooManyLeftOut, _refuse_if_unpaired
 
 
 @pytest.fixture
@@ -154,3 +156,13 @@ def test_all_frames_may_be_bad_and_there_is_still_a_sentence(kind: str, tmp_path
         sentence = r"the subject has 0 usable frame\(s\); at least 2 are needed"
     with pytest.raises(UserError, match=sentence):
         prepare_folder(folder, tmp_path / "out", frame_offset=1, max_left_out=1.0)
+
+
+@pytest.mark.parametrize(("frames", "share", "most"), [(24, 0.05, 4), (24, 0.5, 12), (200, 0.05, 10)])
+def test_a_few_frames_at_the_ends_may_be_without_partner(frames: int, share: float, most: int) -> None:
+    numbered = {number: Path(f"{number}.png") for number in range(frames)}
+    for kinds in ({"images": numbered, "tracking": {0: Path()}}, {"images": {0: Path()}, "tracking": numbered}):
+        files = FrameFiles(Path(), **kinds)
+        _refuse_if_unpaired(files, frames - most, 1, share)
+        with pytest.raises(TooManyLeftOut, match=f"{most + 1} of {frames} .* have no partner under offset 1"):
+            _refuse_if_unpaired(files, frames - most - 1, 1, share)

@@ -11,6 +11,7 @@ from data_prep.prepare.frame_offset import (
     _candidates,
     _frames_with_motion,
     _head_features,
+    _mask_residuals,
     _misfits,
     _mouth_features,
     _standard_errors,
@@ -78,3 +79,14 @@ def test_misfits_are_in_units_of_the_best_offsets_own_and_single_ones_do_not_dec
 def test_neighbours_that_are_alike_count_less(gain: np.ndarray, independent: float) -> None:
     expected = gain.mean() / (gain.std(ddof=1) / np.sqrt(independent))
     assert _standard_errors(gain) == pytest.approx(expected, rel=0.03)
+
+
+def test_what_the_pose_explains_is_taken_out_and_frames_without_a_feature_are_left_out() -> None:
+    predicted = {n: np.random.default_rng(n).normal(size=2) for n in range(200)}
+    observed = {n + 1: 3.0 + 0.5 * values + 0.25 * values[::-1] for n, values in predicted.items()}
+    predicted[7] = np.array([0.0, np.nan])
+    observed[10] = np.array([np.nan, 0.0])
+    found = _mask_residuals(predicted, observed, [1, 190, 196])
+    assert found.keys() == {1, 190}  # 5 common frames are too few
+    assert found[1].keys() == predicted.keys() - {7, 9}
+    assert np.abs(list(found[1].values())).max() < 0.1 < np.abs(list(found[190].values())).max()

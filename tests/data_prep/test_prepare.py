@@ -113,6 +113,9 @@ def test_the_inner_mouth_belongs_to_a_derived_mask() -> None:
     faces = np.concatenate((np.stack((i, j, i + 16), 1), np.stack((j, j + 16, i + 16), 1)))
     mask = filled_lips(screen, faces, 64, 64)
     assert mask[32, 32] == 1 and mask[32, 32 + 15] == 1 and mask[32, 32 + 22] == 0
+    beside = screen + np.float32([64, 0, 0])
+    both = filled_lips(np.concatenate((screen, beside)), np.concatenate((faces, faces + len(screen))), 128, 64)
+    assert np.array_equal(both, np.concatenate((mask, mask), axis=1))
 
 
 def test_without_head_masks_the_matte_is_the_head(tmp_path: Path) -> None:

@@ -131,6 +131,7 @@ def test_parts_that_a_model_may_lack(head_dir: Path) -> None:
     rewrite(head_dir, posedirs=None)
     assets = load_head_assets(head_dir)
     assert not assets.eyelid_dirs.any() and not assets.pose_dirs.any() and not assets.regions
+    assert assets.pose_dirs.shape == (63, 3, 36)
 
 
 @pytest.mark.parametrize("name", ["l_eyelid.npy", "r_eyelid.npy"])
@@ -150,6 +151,10 @@ CASES = {
     "weights do not sum to one": ({"weights": np.full((63, 5), 0.3)}, "vertex 0 sum to 1.5000"),
     "not finite": ({"v_template": np.full((63, 3), np.nan)}, "v_template holds values that are not finite"),
     "child before parent": ({"kintree_table": np.array([[-1, 2, 1, 1, 1], [0, 1, 2, 3, 4]])}, "after its parent"),
+    "a root with a parent": (
+        {"kintree_table": np.array([[0, 0, 1, 1, 1], [0, 1, 2, 3, 4]])},
+        "root first; its parents",
+    ),
     "not numbers": ({"J_regressor": [["a"]]}, "J_regressor is not an array of numbers"),
 }
 

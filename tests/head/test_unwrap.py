@@ -18,7 +18,7 @@ from avatar.files.pickles import load_pickle
 from avatar.head import assets
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.head.rasterize import rasterize_mesh
-from avatar.head.unwrap import NoLayout, unwrap
+from avatar.head.unwrap import NoLayout, _seen_from_in_front, _squared_stretch, unwrap
 from avatar.runs.trained_avatar import load_avatar
 
 EYES = np.array([[0.03, 0.03, 0.06], [-0.03, 0.03, 0.06]])
@@ -153,6 +153,25 @@ def test_other_parts_lie_in_the_corners(count: int) -> None:
     seen = areas(uvs, laid)[len(faces) :].reshape(count, -1)
     assert ((seen > 0).sum(axis=1) > 0.6 * len(small_faces)).all()
     assert covered(uvs, laid) > 0.75
+
+
+def test_a_part_in_a_corner_keeps_the_proportions_of_its_areas() -> None:
+    points, faces = ball()
+    laid, corners = _seen_from_in_front(points, faces, (0.0, 0.0), 1.0)
+    u, w = (points[faces[:, k]] - points[faces[:, 0]] for k in (1, 2))
+    shares = (areas(laid, corners) / np.linalg.norm(np.cross(u, w), axis=1))[points[faces, 2].min(axis=1) > -0.04]
+    assert shares.min() > 0 and shares.std() < 0.05 * shares.mean()
+
+
+@pytest.mark.parametrize(("along", "across"), [(1.0, 1.0), (2.0, 2.0), (2.0, 0.5), (1.0, -3.0)])
+def test_stretch_is_the_mean_square_over_all_directions(along: float, across: float) -> None:
+    rng = np.random.default_rng(0)
+    x, x2, y2 = flat = rng.uniform(0.5, 1.0, (3, 20))
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    triangles = np.stack((np.stack((0 * x, 0 * x), 1), np.stack((x, 0 * x), 1), np.stack((x2, y2), 1)), axis=1)
+    laid = rng.normal(size=(20, 1, 2)) + triangles * (along, across) @ turn.T
+    expected = 0.5 * (along**-2 + across**-2)
+    np.testing.assert_allclose(_squared_stretch(flat.T, laid), expected, rtol=1e-9)
 
 
 def test_what_cannot_be_laid_out() -> None:

@@ -85,6 +85,7 @@ def test_controls_move_the_expression_away_from_the_rest_and_the_jaw_stays_unles
     assert found.expression.tolist() == [0.75, 0.0, -0.5, 0.0, 0.0]
     assert torch.equal(found.jaw, rest.jaw) and found.eyelids.tolist() == [1.0, 0.0]
     assert torch.equal(posed(rest, None, {}).expression, REST)
+    assert posed(rest, None, {"jaw": 0.2}).jaw[:3].tolist() == [1.0, 0.0, 0.0]
 
 
 def test_poses_are_named_in_any_style_of_writing() -> None:

@@ -61,6 +61,8 @@ def test_smoothing_calms_a_joint_that_trembles(joint: str) -> None:
     """As VHAP's neck does, which holds a part of the head's motion."""
     nod = [torch.tensor([1.0, 0, 0, 0, math.cos(a), -math.sin(a)]) for a in (0.05 * (-1) ** n for n in range(20))]
     trembling = drive(20, params=[replace(rest_params(), **{joint: rows}) for rows in nod])
+    cameras = smoothed(replace(trembling, cameras=[camera(200.0, 1 + 0.1 * (-1) ** n) for n in range(20)]), 2.0).cameras
+    assert cameras is not None and max(abs(float(one.t_cam_world[2]) - 1) for one in cameras[6:-6]) < 0.01 * 0.1
     out = torch.stack([getattr(p, joint) for p in smoothed(trembling, 2.0).params])
     assert float(out[:, 5].abs()[6:-6].max()) < 0.01 * 0.05
     if joint == "neck":

@@ -115,6 +115,8 @@ BAD = {
     ),
     "no time": ({"expression": FINE, "fps": 0.0}, "fps is 0, frames a second; it must lie between 1"),
     "other head": ({"expression": FINE, "head": "f00d"}, "was made for another head model"),
+    "a list of heads": ({"expression": FINE, "head": ["f00d"]}, "head must be one text"),
+    "a number for a head": ({"expression": FINE, "head": 1}, "head must be one text"),
     "half a camera": ({"expression": FINE, "R": CAMERA["R"]}, "has a camera without t, K, size"),
     "mirror": ({"expression": FINE, **CAMERA, "R": -CAMERA["R"]}, "R of frame 0 is not a rotation"),
     "no picture": ({"expression": FINE, **CAMERA, "size": [0, 64]}, "the camera has size 0x64"),

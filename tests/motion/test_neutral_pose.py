@@ -79,6 +79,13 @@ def test_lips_are_never_closed_is_known() -> None:
     assert apart is not None and apart > LIPS_OPEN
 
 
+def test_lips_that_are_ajar_on_the_head_model_itself_are_closed() -> None:
+    face = mouth_head()
+    ajar = HeadModel(replace(face, template=face.template + 0.1 * face.expression_dirs[:, :, OPEN]), torch.zeros(0))
+    assert lips_apart(frame_rest([frame()], 0), ajar) == pytest.approx(0.0, abs=1e-6)
+    assert lips_apart(frame_rest([frame(opening=0.2)], 0), ajar) == pytest.approx(0.002, abs=2e-4)
+
+
 def test_one_frame_is_its_own_neutral() -> None:
     neutral = find_neutral([frame(opening=0.3)], HEAD)
     assert neutral.frame == 0 and float(neutral.expression[OPEN]) == pytest.approx(0.3)
