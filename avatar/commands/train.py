@@ -240,6 +240,6 @@ def refuse_other_source(run: Path, source: Source, arguments: Namespace) -> None
         now = now.resolve() if isinstance(now, Path) else now
         if now is None or now is False or now == "" or now == was:
             continue
-        began = f"without {option}" if was in (None, False) else f"with {option} {was}"
+        began = f"without {option}" if was is None or was is False else f"with {option} {was}"
         given_now = option if now is True else f"{option} {now}"
         raise UserError(f"{run} began {began}, not with {given_now}: leave it out to resume, or start a new run")

@@ -226,10 +226,10 @@ def first(run: Path) -> Path:
 def test_what_the_first_folder_was_allowed_later_ones_are(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened: list[Source] = []
+    opened, devices = list[Source](), list[tuple[str, ...]]()
     monkeypatch.setattr(train_refined, "continue_or_begin", lambda source, *_: opened.append(source) or 0)
     monkeypatch.setattr(train_refined, "open_run", lambda *_: None)
-    monkeypatch.setattr(train_refined, "refine_run", lambda *_: 0)
+    monkeypatch.setattr(train_refined, "refine_run", lambda *given: devices.append(given[2:]) or 0)
     words = ("--frame-offset", 1, "--fps", 30, "--max-left-out", 0.5, "--ignore-misfit", "--refine", 1)
     avatar("train", folder, "--out", tmp_path / "run", *words, *QUICK)
     given, later = opened
@@ -237,6 +237,8 @@ def test_what_the_first_folder_was_allowed_later_ones_are(
     assert later == Source(
         tmp_path / "run" / "rounds" / "1" / "someone", given.head, max_left_out=0.5, ignore_misfit=True
     )
+    avatar("train", "--resume", "--out", tmp_path / "run", "--device", "cpu")
+    assert devices == [("auto",), ("cpu",)]
 
 
 def test_rounds_go_on_where_the_folder_has_moved(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,10 @@ from small_runs import SMALL, train_small
 from torch import Tensor
 from tracked_folder import write_tracked_folder
 
+from avatar.commands.arguments import parse
+from avatar.commands.train import refuse_other_source
 from avatar.data.loader import FrameLoader
+from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.lock import locked
@@ -129,6 +132,12 @@ def test_what_a_resumed_run_cannot_change_is_refused(name: str, kept: Path, kept
     options, sentence = CHANGES[name]
     assert sentence in avatar("train", kept_folder, "--out", kept, "--resume", *options, status=1)
     assert newest_checkpoint(kept).step == 8
+
+
+def test_a_zero_that_a_run_began_with_is_named() -> None:
+    options = parse(["train", "someone", "--frame-offset", "1"])
+    with pytest.raises(UserError, match="began with --frame-offset 0, not with --frame-offset 1"):
+        refuse_other_source(Path("run"), Source(Path("someone"), Path("head"), frame_offset=0), options)
 
 
 def test_what_a_resumed_run_began_with_may_be_said_again(begun: Path, own_folder: Path) -> None:
