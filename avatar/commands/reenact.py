@@ -50,7 +50,8 @@ def run_reenact(arguments: Namespace) -> int:
         sound = None
         if is_video(driver):
             video, driver = driver, cached_tracking(driver, head_of(arguments, trained), trained.assets)
-            sound = (video, read_info(driver).source["begins"]) if video.is_file() else None
+            info = read_info(driver)
+            sound = (video, info.source["begins"], info.fps) if video.is_file() else None
         reenact(trained, open_driver(driver, trained, arguments), out, choices, backdrop=backdrop, sound=sound)
     return OK
 

@@ -82,6 +82,8 @@ def train_as_asked(run: Path, arguments: Namespace) -> int:
     if not is_video(arguments.folder):
         check_folder(arguments.folder)
     check_run_folder(run, [arguments.folder, arguments.head, arguments.tracking])
+    if has_plan:
+        raise UserError(f"{run} holds a run with --refine: add --resume to go on with it, or choose another --out")
     if arguments.refine is None:
         return train_new(tracked_source(arguments), overrides, run, arguments.device)
     check_rounds(run, arguments.refine, arguments.minutes)
@@ -127,11 +129,9 @@ def assign_paths(arguments: Namespace) -> None:
 
 
 def check_rounds(run: Path, rounds: int, minutes: float | None) -> None:
-    """Before a video is tracked. Raises UserError for a mistake, and where the folder holds a run, or rounds, already."""
+    """Before a video is tracked. Raises UserError for a mistake, and where the folder holds a run already."""
     check_plan(rounds, minutes)
     refuse_trained(run)
-    if plan_file(run).exists():
-        raise UserError(f"{run} holds a run with --refine: add --resume to go on with it, or choose another --out")
 
 
 def check_plan(rounds: int, minutes: float | None) -> None:
@@ -240,6 +240,6 @@ def refuse_other_source(run: Path, source: Source, arguments: Namespace) -> None
         now = now.resolve() if isinstance(now, Path) else now
         if now is None or now is False or now == "" or now == was:
             continue
-        began = f"without {option}" if was in (None, False) else f"with {option} {was}"
+        began = f"without {option}" if was is None or was is False else f"with {option} {was}"
         given_now = option if now is True else f"{option} {now}"
         raise UserError(f"{run} began {began}, not with {given_now}: leave it out to resume, or start a new run")

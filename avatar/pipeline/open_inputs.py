@@ -11,6 +11,7 @@ from typing import Any
 from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
+from avatar.files.names import ROUNDS_FOLDER
 from avatar.motion.drive import Drive
 from avatar.motion.drive_file import read_drive
 from avatar.runs.run import Run, RunInfo, read_run_info
@@ -58,8 +59,11 @@ def open_run(
 
 
 def moved_source(path: Path, info: RunInfo, head: Path | None, folder: Path | None) -> Source:
-    """The run's source, with what has moved at its new place."""
+    """The run's source, with what has moved at its new place; a run that has moved finds the folder of its last round."""
     source = info.source
+    own = path.joinpath(*source.folder.parts[-3:])
+    if folder is None and not source.folder.is_dir() and own.parts[-3:-2] == (ROUNDS_FOLDER,) and own.is_dir():
+        folder = own
     if folder is not None:
         check_folder(folder)
         source = at_new_place(source, folder)

@@ -62,12 +62,12 @@ def reenact(
     choices: Choices = DEFAULT_CHOICES,
     *,
     backdrop: Backdrop | None = None,
-    sound: tuple[Path, float] | None = None,
+    sound: tuple[Path, float, float] | None = None,
     say: Callable[[str], None] = print,
 ) -> Path:
     """Render the avatar with the driver's motion, as many frames as the driver has, beside the driver's own picture, or
-    alone over a backdrop. `sound` is the driver's video, whose sound goes along, and the second of it at which the driver's
-    frames begin.
+    alone over a backdrop. `sound` is the driver's video, whose sound goes along, the second of it at which the driver's
+    frames begin, and their rate.
 
     Returns the video's path. Raises UserError for choices out of range and for a driver tracked with another head model.
     """
@@ -131,9 +131,12 @@ def reenact(
     return out
 
 
-def drive_sound(video: Path, begins: float, drive: Drive, say: Callable[[str], None]) -> Sound | None:
+def drive_sound(video: Path, begins: float, fps: float, drive: Drive, say: Callable[[str], None]) -> Sound | None:
     """That of the frames of a tracked video, which are numbered in units of 1 / fps from `begins`, seconds, on; None where
-    frames are missing between them."""
+    they are shown at another rate or frames are missing between them."""
+    if drive.fps != fps:
+        say(f"Note: {drive.name} has {fps:g} frames a second and is shown at {drive.fps:g}, so the sound is left out")
+        return None
     first, last = int(drive.names[0]), int(drive.names[-1])
     if last - first + 1 != len(drive):
         say(f"Note: {drive.name} lacks {last - first + 1 - len(drive)} frames, so the sound is left out")

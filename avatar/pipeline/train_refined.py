@@ -68,7 +68,7 @@ def train_round(plan: Plan, source: Source, stage: Path, begin: float, to_come: 
     if status != OK:
         return status, replace(plan, spent=trained - begin)
     run = open_run(stage / RUN_FOLDER, source.head, source.folder)
-    status = refine_run(run, stage / refined_name(plan))
+    status = refine_run(run, stage / refined_name(plan), load_config(plan.overrides).device)
     refined = time.monotonic()
     plan = replace(plan, spent=refined - begin)
     if status == OK and at_once and plan.minutes is not None:

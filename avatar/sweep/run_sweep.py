@@ -63,7 +63,7 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
                 said = engine.poll(handle)
                 if said is not None:
                     del handles[name]
-                    states[name] = final_state(places[name], ended.pop(name, said), spec.retries)
+                    states[name] = final_state(places[name], submitted[name], ended.pop(name, said), spec.retries)
                     if states[name].status == "running":
                         elsewhere.add(name)
                     else:
@@ -104,18 +104,19 @@ def is_open(state: State, retries: int) -> bool:
     return state.status != "failed" or state.attempts <= retries
 
 
-def final_state(place: Path, said: str, retries: int) -> State:
-    """The state of a job whose worker has ended. One that died without a word leaves `running` behind.
+def final_state(place: Path, before: State, said: str, retries: int) -> State:
+    """The state of a job whose worker has ended. One that died without a word leaves `running` behind, or what was there
+    `before` it.
 
     A job that another sweep's worker has taken is running, and nothing is written.
     """
     state = stored_state(place)
     if "is being written by" in said and is_held(place):
         return replace(state, status="running")
+    if state == before or (said and state.status == "waiting"):
+        state = replace(state, status="running", attempts=state.attempts + 1)
     if state.status == "running":
         state = replace(state, status="failed", sentence=said or "the worker ended without a word")
-    elif said and state.status == "waiting":
-        state = replace(state, status="failed", sentence=said, attempts=state.attempts + 1)
     if state.status == "failed" and state.attempts > retries:
         state = replace(state, is_final=True)
     write_state(place, state)

@@ -46,7 +46,7 @@ def split_frames_of(
             f"the folder names no {lacking} frames: its last ones are tested"
         ]
     left = len(parts) - len(listed.train) - len(listed.test)
-    unused = f" ({left} of validation are not used)" if left else ""
+    unused = f" ({left} are not used)" if left else ""
     return listed, [*notes, f"the folder's own division into training and test frames is kept{unused}"]
 
 
@@ -68,7 +68,7 @@ def _divide_shots(
         # A folder of refined tracking names no part for what was of validation.
         used_times = {shot.time for shot, part in zip(shots, parts, strict=True) if part not in ("val", None)}
         unused = set(times) - tested - used_times
-        left = f" ({len(unused)} of validation are not used)" if unused else ""
+        left = f" ({len(unused)} are not used)" if unused else ""
         notes.append(f"the folder's own division into training and test times is kept{left}")
     else:
         tested = {times[place] for place in split_frames(len(times), test_frames).test}

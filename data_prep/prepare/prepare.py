@@ -252,7 +252,7 @@ def _records(
         return paths[number].relative_to(files.folder).as_posix() if paths else None
 
     def mask(kind: str, folder: str, paths: dict[int, Path], number: int) -> str | None:
-        return f"{folder}/{names[number]}.png" if kind == "derived" else inside(paths, number)
+        return f"{folder}/{number:05d}.png" if kind == "derived" else inside(paths, number)
 
     return tuple(
         FrameRecord(

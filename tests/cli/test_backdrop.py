@@ -154,6 +154,12 @@ def test_a_damaged_sound_costs_no_picture(tmp_path: Path) -> None:
 def test_sound_begins_with_the_shot_and_is_left_out_where_frames_are_missing() -> None:
     params, said = [rest_params()] * 3, []
     drive = Drive("a", 10.0, ("00005", "00006", "00007"), params, None, torch.zeros(0))
-    assert drive_sound(Path("a.mp4"), 2.0, drive, said.append) == Sound(Path("a.mp4"), 2.5, 0.3) and not said
+    assert drive_sound(Path("a.mp4"), 2.0, 10.0, drive, said.append) == Sound(Path("a.mp4"), 2.5, 0.3) and not said
     gap = Drive("a", 10.0, ("00000", "00001", "00009"), params, None, torch.zeros(0))
-    assert drive_sound(Path("a.mp4"), 2.0, gap, said.append) is None and "lacks 7 frames" in said[0]
+    assert drive_sound(Path("a.mp4"), 2.0, 10.0, gap, said.append) is None and "lacks 7 frames" in said[0]
+
+
+def test_a_video_that_is_shown_faster_than_it_was_filmed_is_silent() -> None:
+    said = list[str]()
+    drive = Drive("a", 20.0, ("00005", "00006"), [rest_params()] * 2, None, torch.zeros(0))
+    assert drive_sound(Path("a.mp4"), 2.0, 10.0, drive, said.append) is None and "shown at 20" in said[0]

@@ -159,7 +159,7 @@ def test_training_in_rounds(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert [Path(one["run"]).parts[-2:] for one in raw["rounds"]] == [("1", "run"), ("2", "run")]
     assert "refined, fitted" in avatar("eval", run, "--protocol", "strict")
     assert "is complete" in avatar("train", "--resume", "--out", run, "--device", "cpu", "trainer.seed=0")
-    assert "holds a run already" in avatar("train", folder, "--out", run, "--refine", 1, *QUICK, status=1)
+    assert "holds a run with --refine" in avatar("train", folder, "--out", run, "--refine", 1, *QUICK, status=1)
 
 
 def test_training_in_rounds_keeps_to_its_time(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,10 +226,10 @@ def first(run: Path) -> Path:
 def test_what_the_first_folder_was_allowed_later_ones_are(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened: list[Source] = []
+    opened, devices = list[Source](), list[tuple[str, ...]]()
     monkeypatch.setattr(train_refined, "continue_or_begin", lambda source, *_: opened.append(source) or 0)
     monkeypatch.setattr(train_refined, "open_run", lambda *_: None)
-    monkeypatch.setattr(train_refined, "refine_run", lambda *_: 0)
+    monkeypatch.setattr(train_refined, "refine_run", lambda *given: devices.append(given[2:]) or 0)
     words = ("--frame-offset", 1, "--fps", 30, "--max-left-out", 0.5, "--ignore-misfit", "--refine", 1)
     avatar("train", folder, "--out", tmp_path / "run", *words, *QUICK)
     given, later = opened
@@ -237,6 +237,8 @@ def test_what_the_first_folder_was_allowed_later_ones_are(
     assert later == Source(
         tmp_path / "run" / "rounds" / "1" / "someone", given.head, max_left_out=0.5, ignore_misfit=True
     )
+    avatar("train", "--resume", "--out", tmp_path / "run", "--device", "cpu")
+    assert devices == [("auto",), ("cpu",)]
 
 
 def test_rounds_go_on_where_the_folder_has_moved(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -274,7 +276,7 @@ def test_rounds_go_on_where_they_stopped(folder: Path, tmp_path: Path, monkeypat
     stage = run / "rounds" / "1"
     stamps = [path.stat().st_mtime_ns for path in list_checkpoints(stage / "run" / "checkpoints")]
     assert stamps and not (run / "run.json").exists()
-    assert "add --resume" in avatar(*words, status=1)
+    assert all("add --resume" in avatar(*each, status=1) for each in (words, [*words[:6], *QUICK]))
     assert "began with --refine 1, not 2" in avatar("train", "--resume", "--out", run, "--refine", 2, status=1)
     changed = avatar("train", "--resume", "--out", run, "trainer.iterations=11", status=1)
     assert "leave the override out" in changed

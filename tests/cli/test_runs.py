@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,13 +17,17 @@ from small_runs import SMALL, train_small
 from torch import Tensor
 from tracked_folder import write_tracked_folder
 
+from avatar.commands.arguments import parse
+from avatar.commands.train import refuse_other_source
 from avatar.data.loader import FrameLoader
+from avatar.data.source import Source
 from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.files.lock import locked
 from avatar.gaussians.base_model import Avatar
 from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
+from avatar.pipeline.open_inputs import moved_source
 from avatar.runs.checkpoint import Checkpoint, list_checkpoints, newest_checkpoint, save_checkpoint
 from avatar.runs.run import read_run_info
 from avatar.train import trainer
@@ -129,6 +134,23 @@ def test_what_a_resumed_run_cannot_change_is_refused(name: str, kept: Path, kept
     options, sentence = CHANGES[name]
     assert sentence in avatar("train", kept_folder, "--out", kept, "--resume", *options, status=1)
     assert newest_checkpoint(kept).step == 8
+
+
+def test_a_zero_that_a_run_began_with_is_named() -> None:
+    options = parse(["train", "someone", "--frame-offset", "1"])
+    with pytest.raises(UserError, match="began with --frame-offset 0, not with --frame-offset 1"):
+        refuse_other_source(Path("run"), Source(Path("someone"), Path("head"), frame_offset=0), options)
+
+
+def test_a_run_that_has_moved_finds_the_folder_of_its_last_round(begun: Path) -> None:
+    info, head = read_run_info(begun), begun.parent / "someone" / "head_model"
+    away = replace(info, source=Source(Path("/before/rounds/2/someone"), head))
+    with pytest.raises(UserError, match="is gone"):
+        moved_source(begun, away, None, None)
+    (begun / "rounds" / "2" / "someone" / "frames").mkdir(parents=True)
+    assert moved_source(begun, away, None, None) == Source(begun / "rounds" / "2" / "someone", head)
+    with pytest.raises(UserError, match="is gone"):
+        moved_source(begun, replace(info, source=Source(Path("/before"), head)), None, None)
 
 
 def test_what_a_resumed_run_began_with_may_be_said_again(begun: Path, own_folder: Path) -> None:

@@ -55,6 +55,18 @@ def test_prepared_once_and_again_when_an_input_changes(tmp_path: Path, monkeypat
     assert sorted(p.name for p in (tmp_path / "cache" / "subjects").iterdir()) == sorted([first.name, other.name])
 
 
+@pytest.mark.parametrize("name", ["a line\nand another ", "not UTF-8 \udcff"])
+def test_pictures_of_any_name_are_prepared_once(name: str, tmp_path: Path) -> None:
+    folder = write_tracked_folder(tmp_path / "subject", frames=10, mouth_masks=False)
+    for path in [*(folder / "imgs").iterdir(), *(folder / "alpha").iterdir(), *(folder / "parsing").iterdir()]:
+        path.rename(path.with_name(name + path.name))
+    subject, _ = prepare_folder(folder, tmp_path / "prepared", frame_offset=1)
+    assert prepare_folder(folder, tmp_path / "prepared", frame_offset=1)[1] == [
+        f"using the prepared subject {tmp_path / 'prepared'}"
+    ]
+    assert subject.frame(0, None).mouth_mask.any()
+
+
 def test_another_head_model_prepares_again(tmp_path: Path) -> None:
     """Also in a place that was chosen, which the key of the cache does not name."""
     folder = write_tracked_folder(tmp_path / "subject", frames=12)

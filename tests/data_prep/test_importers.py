@@ -28,9 +28,7 @@ def test_vhap(tracked: Path, original: Subject, tmp_path: Path) -> None:
     assert_same_pictures(subject, original, tracked)
     assert all(torch.equal(subject.frame(i).alpha, original.frame(i).head_mask) for i in range(FRAMES))
     assert subject.split == (tuple(range(16)), tuple(range(18, FRAMES)))
-    assert (
-        "note: the folder's own division into training and test frames is kept (2 of validation are not used)" in said
-    )
+    assert "note: the folder's own division into training and test frames is kept (2 are not used)" in said
     assert (
         "note: the tracking has 100 expression coefficients, the head model 10; the others are zero and left out"
         in said

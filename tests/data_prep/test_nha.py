@@ -140,7 +140,7 @@ def test_frames_may_be_listed_by_name_and_left_out_of_both(copy: Path, tmp_path:
     (copy / "split.json").write_text(json.dumps({"train": names[:10], "val": names[9:12]}))
     subject, said = prepare_folder(copy, tmp_path / "out")
     assert subject.split == (tuple(range(9)), (9, 10, 11))
-    assert any("(12 of validation are not used)" in line for line in said)
+    assert any("(12 are not used)" in line for line in said)
 
 
 def test_without_a_split_the_last_frames_are_tested(copy: Path, tmp_path: Path) -> None:

@@ -55,4 +55,4 @@ def test_times_of_validation_alone_are_neither_trained_on_nor_tested(
     recording = subject.recording
     assert {recording.time(i) for i in recording.split.train} == {0, 1, 2}
     assert {recording.time(i) for i in recording.split.test} == {4, 5}
-    assert any("(1 of validation are not used)" in line for line in said)
+    assert any("(1 are not used)" in line for line in said)

@@ -46,7 +46,7 @@ def test_a_folders_own_division_is_kept_and_what_it_lacks_is_said() -> None:
     parts: dict[int, str | None] = {0: "train", 1: "val", 2: "train", 3: "test"}
     split, notes = split_frames_of(folder(parts), range(4))
     assert split == Split((0, 2), (3,))
-    assert notes == ["the folder's own division into training and test frames is kept (1 of validation are not used)"]
+    assert notes == ["the folder's own division into training and test frames is kept (1 are not used)"]
     split, notes = split_frames_of(folder({0: "val", 1: "val", 2: "test"}), range(3))
     assert split == Split((0, 1), (2,)) and len(notes) == 2
     assert notes[0] == "the folder names no training frames: those of validation are trained on"
@@ -82,7 +82,7 @@ def test_a_rigs_own_division_holds_out_the_cameras_that_train_nothing() -> None:
     split, notes = split_frames_of(folder(parts, times=4), range(12))
     assert split == Split((0, 1, 4, 5), (2, 6, 8, 9, 10))
     assert notes == [
-        "the folder's own division into training and test times is kept (1 of validation are not used)",
+        "the folder's own division into training and test times is kept (1 are not used)",
         "camera 12 is held out",
     ]
     with pytest.raises(UserError, match="every camera is held out"):

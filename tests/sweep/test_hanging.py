@@ -176,3 +176,26 @@ def test_a_job_that_another_sweep_has_taken_is_waited_for(place: Path, monkeypat
         state = run_jobs(place.parents[1], SPEC, engine, Progress())["j"]
     assert state == State("done", 1, "elsewhere:17") and engine.submissions == 1
     assert looks[:3] == ["running"] * 3, "nothing is written over"
+
+
+class EndsAtOnce(TakenByAnother):
+    """An engine whose workers end before they write anything."""
+
+    def submit(self, folders: Sequence[Path]) -> list[Any]:
+        self.submissions += 1
+        assert self.submissions < 9
+        return list(folders)
+
+    def poll(self, handle: Any) -> str | None:
+        return "the worker was killed by signal 9"
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("before", [State(), State("running", 1, "here:1"), State("failed", 1, "here:1")])
+def test_workers_that_end_before_they_write_anything_are_tried_as_often_as_others(place: Path, before: State) -> None:
+    engine = EndsAtOnce(place)
+    write_state(place, before)
+    spec = Spec(SPEC.jobs, SPEC.resources, retries=2)
+    state = run_jobs(place.parents[1], spec, engine, Progress())["j"]
+    assert state.status == "failed" and state.is_final and state.attempts == 3
+    assert engine.submissions == 3 - before.attempts
