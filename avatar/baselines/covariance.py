@@ -106,8 +106,8 @@ class CovarianceAvatar(FlashAvatar):
 
     @classmethod
     def step_needs(cls, config: ModelConfig, gaussians: int, size: tuple[int, int]) -> list[Need]:
-        """Of each head: the factor as a square, its diagonal and both gradients; the latent's columns of the covariance and
-        its block's factors, with theirs."""
+        """Of each head: the factor as a square, its diagonal and both gradients, and one square more that is free but
+        not used again; the latent's columns of the covariance and its block's factors, with theirs."""
         n = config.latent_dim
-        squares = sum(4 * (m + n) ** 2 + 2 * (m + n) * n + 2 * n**2 for m in HEADS.values())
+        squares = sum(5 * (m + n) ** 2 + 2 * (m + n) * n + 2 * n**2 for m in HEADS.values())
         return [Need("the covariances", 4 * gaussians * squares, "model.uv_size or model.latent_dim")]
