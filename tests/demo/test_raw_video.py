@@ -53,6 +53,7 @@ def test_it_repeats_and_every_seed_has_its_room(pictures: list[np.ndarray]) -> N
     assert np.abs(make_room(SIZE, 1) - make_room(SIZE, 2)).mean() > 10
 
 
+@pytest.mark.slow
 def test_outdoors_the_background_moves_behind_the_same_person(pictures: list[np.ndarray]) -> None:
     first, second = (list(filmed(FRAMES, SIZE, SEED, outdoors=True)) for _ in range(2))
     for one, other in zip(first, second, strict=True):
@@ -71,6 +72,7 @@ def test_outdoors_the_background_moves_behind_the_same_person(pictures: list[np.
         assert far.sum() > 500 and np.abs(first[n] - street[n])[far].mean() < 4.0
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_video_and_a_head_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, head = tmp_path / "me.mp4", tmp_path / "head_model"
     options = ["--video", "--frames", "3", "--size", "96"]

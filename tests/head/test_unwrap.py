@@ -237,6 +237,7 @@ def test_such_a_model_is_named_by_its_folder(tmp_path: Path) -> None:
         without_obj(tmp_path)
 
 
+@pytest.mark.slow
 def test_an_avatar_is_trained_without_an_obj(tmp_path: Path) -> None:
     folder = write_tracked_folder(tmp_path / "someone", frames=30, size=48)
     made = without_obj(folder / "head_model")

@@ -140,6 +140,7 @@ def places(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str |
         yield from places(one, (*path, key))
 
 
+@pytest.mark.slow
 def test_damaged_results_get_a_sentence(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("avatar.report.page.frame_panels", lambda run: [])
     monkeypatch.setattr("avatar.report.page._curves", lambda run: [])

@@ -183,6 +183,7 @@ def test_an_error_in_a_control_is_one_counted_line(
         assert len(said) == 1 and still_drawn(viewer, page)
 
 
+@pytest.mark.slow
 def test_half_open_requests_do_not_stop_the_viewer(
     viewer: Viewer, said: list[str], capfd: pytest.CaptureFixture[str]
 ) -> None:

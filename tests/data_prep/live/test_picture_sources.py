@@ -116,6 +116,7 @@ class Hanging(Scripted):
         self.is_closed = True
 
 
+@pytest.mark.slow
 def test_who_waits_for_a_source_that_hangs_is_told() -> None:
     source = Hanging(0)
     source.silent_after = 0.05

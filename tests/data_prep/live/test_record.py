@@ -148,6 +148,7 @@ def test_a_camera_that_ends_leaves_the_film(filming: Callable[..., StandIn], tmp
     assert len(iio.imread(tmp_path / "me.mkv")) == pytest.approx((12 - WAITED) * FPS, abs=1)
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_the_film(filming: Callable[..., StandIn], tmp_path: Path) -> None:
     looked: list[float] = []
 

@@ -86,6 +86,7 @@ def test_heights_are_along_the_heads_axis_whatever_the_picture(width: int, heigh
     assert np.arctan2(gx / width, -gy / height) == pytest.approx(np.arctan2(axis[0], -axis[1]), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_masks_repeat() -> None:
     renderer = renderer_of(1)
     performance = perform(1, 2, "speech")

@@ -218,6 +218,7 @@ TIMES = {  # of picture n, in seconds
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", TIMES)
 def test_mattes_of_a_part_are_of_its_own_pictures(kind: str, tmp_path: Path) -> None:
     """Wherever the part begins and ends, whatever times the pictures have."""
