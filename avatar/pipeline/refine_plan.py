@@ -18,6 +18,7 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.names import ROUNDS_FOLDER
 from avatar.files.read import read_json
+from avatar.pipeline.choose_device import choose_device
 from avatar.pipeline.train import new_avatar
 from avatar.pose_refinement.refine_subject import estimated_seconds
 from avatar.train.cost_estimate import measure_cost
@@ -115,7 +116,7 @@ def steps_in_time(
     source: Source, overrides: list[str], rounds: int, minutes: float | None, begin: float
 ) -> tuple[int, int]:
     """Steps of the run itself and of each round: the configuration's, or as many as the minutes allow that began at
-    `begin`, of `time.monotonic`, by what this machine shows on a few; these count, as preparing the subject does.
+    `begin`, of `time.monotonic`, by what this CPU shows on a few; these count, as preparing the subject does.
 
     Raises UserError where they allow too few.
     """
@@ -123,7 +124,7 @@ def steps_in_time(
     subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
     frames = len(subject.split.train)
     asked = within_epochs(config.trainer, frames).iterations
-    if minutes is None:
+    if minutes is None or choose_device(config.device, lambda _: None) != CPU:  # what a GPU takes, the first round shows
         return asked, round_steps(asked, frames)
     term = choose_perceptual(config.trainer, lambda _: None, size=subject.image_size(config.data.size))
     avatar = new_avatar(assets, subject, config, term.name, CPU)

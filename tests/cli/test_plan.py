@@ -6,6 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
+from small_runs import SMALL
+from tracked_folder import write_tracked_folder
 
 from avatar.data.source import Source
 from avatar.errors import UserError
@@ -34,6 +37,16 @@ def test_plan_survives_a_round_trip(tmp_path: Path) -> None:
     made = refine_plan.Plan(1, Source(tmp_path, tmp_path / "head_model"), ("data.size=64",), None, 1000, 77)
     made.save(tmp_path)
     assert refine_plan.Plan.load(tmp_path) == made
+
+
+def test_no_steps_of_the_cpu_are_measured_for_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They would say "too little" of what a GPU has time for; the first round shows what it takes."""
+    folder = write_tracked_folder(tmp_path / "someone", frames=14, size=40)
+    source = Source(folder, folder / "head_model", frame_offset=1)
+    monkeypatch.setattr(refine_plan, "choose_device", lambda *_: torch.device("cuda"))
+    monkeypatch.setattr(refine_plan, "measure_cost", lambda *_: pytest.fail("measured on the CPU"))
+    overrides = [*SMALL, "trainer.iterations=1000"]
+    assert refine_plan.steps_in_time(source, overrides, 1, 0.001, 0.0) == (1000, 1000)
 
 
 @pytest.mark.parametrize(
