@@ -108,6 +108,11 @@ def test_too_few_pictures_or_nothing_behind() -> None:
     assert learn_plate(pairs[:2]) is None
     assert learn_plate([]) is None
     assert learn_plate([(image, np.full_like(matte, 255)) for image, matte in pairs]) is None
+    for columns in range(1, 12):  # of nobody: what is left of them is seen in a single column, of an odd number
+        somebody = np.full((SIZE, SIZE), 255, np.uint8)
+        somebody[:, SIZE - columns :] = 0
+        plate = learn_plate([(image, somebody) for image, _ in pairs])
+        assert plate is None or plate.noise >= 1.0
 
 
 def test_large_pictures_are_learned_at_the_size_at_which_they_are_matted(monkeypatch: pytest.MonkeyPatch) -> None:
