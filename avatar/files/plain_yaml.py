@@ -45,7 +45,10 @@ class _PlainLoader(yaml.SafeLoader):
             if key.value in seen:
                 raise yaml.YAMLError(f"{key.value!r} stands there twice")
             seen.add(key.value)
-        return super().construct_mapping(node, deep)
+        made = super().construct_mapping(node, deep)
+        if len(made) < len(seen):
+            raise yaml.YAMLError("two keys mean the same, such as 1 and yes: put one in quotes")
+        return made
 
     def construct_yaml_int(self, node: Any) -> int:
         if len(node.value) > MAX_DIGITS:

@@ -63,6 +63,9 @@ def test_the_bounds_are_said(tmp_path: Path) -> None:
     path.write_text("a: 1\na: 2")
     with pytest.raises(UserError, match="'a' stands there twice"):
         read_yaml(path, 2**20)
+    path.write_text("variants: {1: [], yes: []}")
+    with pytest.raises(UserError, match="two keys mean the same"):
+        read_yaml(path, 2**20)
 
 
 def test_the_protocols_of_the_program_are_plain() -> None:
