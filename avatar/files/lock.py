@@ -21,13 +21,13 @@ LOCK_FILE = ".lock"
 def locked(folder: Path, otherwise: str = "choose another --out") -> Iterator[None]:
     """Hold the folder's lock; the system lets go of it when the process ends, however it ends.
 
-    A folder that this made, and that nothing was written into, is gone afterwards. `otherwise` is what a person can do
+    Folders that this made, and that nothing was written into, are gone afterwards. `otherwise` is what a person can do
     where it cannot be had.
 
     Raises UserError naming the process that holds it, and when the folder cannot be written.
     """
     path = folder / LOCK_FILE
-    is_new = not folder.exists()
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = _acquire(path)
@@ -42,9 +42,9 @@ def locked(folder: Path, otherwise: str = "choose another --out") -> Iterator[No
             if _is_same(file, path):  # else the folder has another name, and this one may be another process's
                 path.unlink()
         os.close(file)
-        if is_new:
-            with suppress(OSError):  # it is not empty
-                folder.rmdir()
+        with suppress(OSError):  # it is not empty
+            for place in made:
+                place.rmdir()
 
 
 def is_held(folder: Path) -> bool:

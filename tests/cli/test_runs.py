@@ -240,8 +240,10 @@ def test_a_lock_is_held_once(tmp_path: Path) -> None:
         locked(tmp_path / "run"),
     ):
         raise AssertionError("the lock was taken twice")
-    with locked(tmp_path / "run"):
+    (tmp_path / "kept").mkdir()
+    with locked(tmp_path / "kept" / "runs" / "run"):
         pass
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]  # and nothing that was made for the lock
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be written"), locked(tmp_path / "file" / "run"):
         pass
