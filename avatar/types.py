@@ -37,7 +37,7 @@ class Camera:
     """
 
     R_cam_world: Float[Tensor, "3 3"]
-    t_cam_world: Float[Tensor, 3]  # metres
+    t_cam_world: Float[Tensor, " 3"]  # metres
     fx: float  # pixels
     fy: float
     cx: float
@@ -70,10 +70,12 @@ class HeadParams:
     """What moves a FLAME-format head in one frame; identity coefficients belong to the subject, not to the frame."""
 
     expression: Float[Tensor, " E"]  # coefficients of the expression basis
-    jaw: Float[Tensor, 6]  # 6D rotation
-    eyes: Float[Tensor, 12]  # two 6D rotations, left then right
-    eyelids: Float[Tensor, 2]  # blendshape weights, left then right
-    neck: Float[Tensor, 6]  # 6D rotation of the head against the torso: it moves the torso; not a condition of the MLP
+    jaw: Float[Tensor, " 6"]  # 6D rotation
+    eyes: Float[Tensor, " 12"]  # two 6D rotations, left then right
+    eyelids: Float[Tensor, " 2"]  # blendshape weights, left then right
+    neck: Float[
+        Tensor, " 6"
+    ]  # 6D rotation of the head against the torso: it moves the torso; not a condition of the MLP
 
     def condition(self) -> Float[Tensor, " C"]:
         """The deformation network's per-frame input: expression, jaw, eyes, eyelids (120 values with 100 expressions)."""

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
+from array_shapes import ARRAY
 from jaxtyping import TypeCheckError
 
 from avatar.files.pickles import load_pickle
@@ -24,3 +28,12 @@ def test_functions_and_dataclasses_are_checked_where_they_have_arrays() -> None:
 def test_wrong_shapes_reach_the_programs_own_refusal() -> None:
     with pytest.raises(ValueError, match="target"):
         psnr(torch.zeros(4, 4, 3), torch.zeros(5, 4, 3))
+
+
+def test_shapes_are_texts() -> None:
+    """jaxtyping checks nothing where it cannot evaluate an annotation, such as Float[Tensor, 3]."""
+    root = Path(__file__).parents[1]
+    sources = [path for folder in ("avatar", "data_prep") for path in (root / folder).rglob("*.py")]
+    shaped = re.compile(ARRAY.pattern + r"[\w.]+,\s*(.)")
+    found = {match[0] for path in sources for match in shaped.finditer(path.read_text(encoding="utf-8"))}
+    assert len(found) > 10 and all(text.endswith('"') for text in found), found

@@ -91,7 +91,9 @@ def test_only_what_is_on_top_uses_the_importers() -> None:
 
 def test_only_the_table_leads_to_the_gpu() -> None:
     """What imports Triton is imported by its like and through the table of GPU functions, and by nothing else."""
-    of_gpu = {name for name, used in all_imports().items() if any(other.startswith("avatar.kernels.") for other in used)}
+    of_gpu = {
+        name for name, used in all_imports().items() if any(other.startswith("avatar.kernels.") for other in used)
+    }
     of_gpu |= {place.rpartition(".")[0] for place in GPU_FUNCTIONS.values()}
     leaks = {(name, other) for name, used in all_imports().items() for other in used & of_gpu if name not in of_gpu}
     assert not leaks

@@ -127,6 +127,7 @@ def test_a_stream_takes_few_frames_ahead_and_stops_when_it_is_dropped(monkeypatc
     assert threading.active_count() == threads
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize("threads", ["1", "2"])
 def test_a_bad_frame_is_raised_when_its_turn_comes(threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AVATAR_THREADS", threads)

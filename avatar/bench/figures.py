@@ -32,7 +32,7 @@ class Figures:
 @torch.no_grad()
 def head_figures(
     avatar: Avatar,
-    background: Float[Tensor, 3],
+    background: Float[Tensor, " 3"],
     driven: Sequence[tuple[HeadParams, Camera, Frame]],
     network: Lpips | None = None,
 ) -> Figures:

@@ -41,7 +41,7 @@ class RigCamera:
             raise ValueError(f"size must be a whole number of pixels, got {size}")
         return size, max(1, round(size * self.height / self.width))
 
-    def sees(self, R_ref_world: Float[Tensor, "3 3"], t_ref_world: Float[Tensor, 3]) -> Camera:
+    def sees(self, R_ref_world: Float[Tensor, "3 3"], t_ref_world: Float[Tensor, " 3"]) -> Camera:
         """The camera of a head that the reference camera sees in this pose; computed in float64."""
         R = torch.tensor(self.R, dtype=torch.float64).reshape(3, 3)
         return Camera(

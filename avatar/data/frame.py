@@ -32,7 +32,7 @@ class Frame:
         """The row of the tracks that `params` are of."""
         return self.index if self.shared_time is None else self.shared_time
 
-    def composite(self, background: Float[Tensor, 3]) -> Float[Tensor, "H W 3"]:
+    def composite(self, background: Float[Tensor, " 3"]) -> Float[Tensor, "H W 3"]:
         """The training target: matte over the background, then the head mask over the background again.
 
         Source: FlashAvatar and HyperGaussians, data loading (`img*alpha + bg*(1-alpha)`, then `*mask + bg*(1-mask)`).

@@ -69,7 +69,7 @@ def encode_ply(gaussians: Gaussians, comment: str = "", up: Up = "-y") -> bytes:
     return "\n".join(header).encode() + np.ascontiguousarray(values).tobytes()
 
 
-def turned(gaussians: Gaussians, q: Float[Tensor, 4]) -> Gaussians:
+def turned(gaussians: Gaussians, q: Float[Tensor, " 4"]) -> Gaussians:
     """The same, turned by a unit quaternion of double precision."""
     axes = torch.eye(4, dtype=q.dtype)[1:]  # as quaternions
     R = quaternion_product(quaternion_product(q.expand(3, 4), axes), (q * q.new_tensor([1, -1, -1, -1])).expand(3, 4))

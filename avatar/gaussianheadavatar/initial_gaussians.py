@@ -46,7 +46,7 @@ def initial_gaussians(
     texels: UVTexels,
     frames: Sequence[Frame],
     count: int,
-    centre: Float[Tensor, 3],
+    centre: Float[Tensor, " 3"],
     half: float,
     fitted: bool = False,
 ) -> InitialGaussians:
@@ -71,7 +71,7 @@ def initial_gaussians(
 
 
 def beyond_mesh(
-    head: HeadModel, mesh: Embedding, frames: Sequence[Frame], centre: Float[Tensor, 3], half: float, fitted: bool
+    head: HeadModel, mesh: Embedding, frames: Sequence[Frame], centre: Float[Tensor, " 3"], half: float, fitted: bool
 ) -> Float[Tensor, "M 3"]:
     """Points of hull or surface that are not on the mesh; all of its points where it is nowhere beyond it."""
     cell = 2.0 * REACH * half / CELLS
@@ -97,7 +97,7 @@ def beyond_mesh(
 
 
 def colours_beyond(
-    head: HeadModel, points: Float[Tensor, "H 3"], frames: Sequence[Frame], centre: Float[Tensor, 3]
+    head: HeadModel, points: Float[Tensor, "H 3"], frames: Sequence[Frame], centre: Float[Tensor, " 3"]
 ) -> Float[Tensor, "H 3"]:
     """The mean colour that the frames show at points beyond the mesh; outwards is away from the head's centre."""
     surface = head.neutral_vertices(), head.faces

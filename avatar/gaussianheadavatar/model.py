@@ -207,11 +207,11 @@ class GaussianHeadAvatar(Avatar):
         )
         return rotation_matrix_to_axis_angle(torch.stack((turn, neck))).flatten()
 
-    def draw(self, gaussians: Any, camera: Camera, background: Float[Tensor, 3], **options: Any) -> Rendering:
+    def draw(self, gaussians: Any, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Rendering:
         return self.enlarged(self.splatted(gaussians, camera, **options), camera, background)
 
     def training_images(
-        self, gaussians: Any, camera: Camera, background: Float[Tensor, 3], sh_degree: int
+        self, gaussians: Any, camera: Camera, background: Float[Tensor, " 3"], sh_degree: int
     ) -> list[Float[Tensor, "_ _ 3"]]:
         """The picture, and the first three channels of the splatted features, which are a small picture."""
         small = self.splatted(gaussians, camera)
@@ -226,7 +226,7 @@ class GaussianHeadAvatar(Avatar):
             *gaussians, small_camera(camera, self.config.upsampling), white, blur=self.config.blur, **options
         )
 
-    def enlarged(self, small: Rendering, camera: Camera, background: Float[Tensor, 3]) -> Rendering:
+    def enlarged(self, small: Rendering, camera: Camera, background: Float[Tensor, " 3"]) -> Rendering:
         height, width, factor = camera.height, camera.width, self.config.upsampling
         alphas = small.alpha[None, None]
         alpha = interpolate(alphas, scale_factor=factor, mode="bilinear")[0, 0, :height, :width]
@@ -292,6 +292,6 @@ def small_camera(camera: Camera, factor: int) -> Camera:
     return replace(camera, **lens, width=-(-camera.width // factor), height=-(-camera.height // factor))
 
 
-def over_background(white: Rendering, background: Float[Tensor, 3]) -> Rendering:
+def over_background(white: Rendering, background: Float[Tensor, " 3"]) -> Rendering:
     """What was drawn over white, over another background."""
     return Rendering(white.image + (1.0 - white.alpha)[..., None] * (background - 1.0), white.alpha)

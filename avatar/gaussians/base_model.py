@@ -139,12 +139,12 @@ class Avatar(nn.Module):
         """Parts, and what takes their place in a frozen copy."""
         return {}
 
-    def draw(self, gaussians: Any, camera: Camera, background: Float[Tensor, 3], **options: Any) -> Rendering:
+    def draw(self, gaussians: Any, camera: Camera, background: Float[Tensor, " 3"], **options: Any) -> Rendering:
         """A picture of what `forward` gave; `options` as those of `splat`."""
         return splat(gaussians, camera, background, **{"blur": self.config.blur, **options})
 
     def training_images(
-        self, gaussians: Any, camera: Camera, background: Float[Tensor, 3], sh_degree: int
+        self, gaussians: Any, camera: Camera, background: Float[Tensor, " 3"], sh_degree: int
     ) -> list[Float[Tensor, "_ _ 3"]]:
         """What a training step compares with the frame: the picture, then smaller ones where the model draws any."""
         return [self.draw(gaussians, camera, background, sh_degree=sh_degree).image]

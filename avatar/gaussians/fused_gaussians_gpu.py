@@ -175,7 +175,7 @@ class _Fused(torch.autograd.Function):
         return by_vertices, by_neck, by_logits, by_values, by_packed, *by_base, None, None, None
 
 
-def _neck_gradient(neck: Float[Tensor, 6], by_turn: Float[Tensor, "3 3"]) -> Float[Tensor, 6]:
+def _neck_gradient(neck: Float[Tensor, " 6"], by_turn: Float[Tensor, "3 3"]) -> Float[Tensor, " 6"]:
     with torch.enable_grad():
         leaf = neck.detach().requires_grad_()
         (gradient,) = torch.autograd.grad(matrix_from_6d(leaf).mT, leaf, by_turn)

@@ -34,6 +34,6 @@ def learned_turning(rotations: Float[Tensor, "T 3 3"]) -> Float[Tensor, "3 9"]:
     return (turning * (1.0 / spread if spread > 1e-4 else 0.0)).float()
 
 
-def head_rotation_input(turning: Float[Tensor, "3 9"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, 3]:
+def head_rotation_input(turning: Float[Tensor, "3 9"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
     """How the head is turned where the camera's `head_rotation` is `rotation`; differentiable."""
     return (turning @ rotation.reshape(9).to(turning.dtype)).clamp(-LIMIT, LIMIT)

@@ -39,7 +39,7 @@ class Skull:
         neutral = head.neutral_vertices()
         return Skull(embedding.points(neutral), embedding.points((1 - shares[:, None]) * (neutral - joint)))
 
-    def points(self, neck: Float[Tensor, 6]) -> Float[Tensor, "N 3"]:
+    def points(self, neck: Float[Tensor, " 6"]) -> Float[Tensor, "N 3"]:
         """On the skull above the torso that `neck`, a 6D rotation, turns; metres. Differentiable; reads nothing back."""
         device = self.at_rest.device
         if neck.is_cpu and not neck.requires_grad and tuple(neck.tolist()) == IDENTITY_6D:
@@ -56,7 +56,7 @@ class SkullBinding(NamedTuple):
     """What holds points in a frame."""
 
     skull: Skull
-    neck: Float[Tensor, 6]
+    neck: Float[Tensor, " 6"]
     logits: Float[Tensor, " N"]  # of the shares that keep with the skull
 
 

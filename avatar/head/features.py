@@ -47,6 +47,6 @@ def _rims(assets: HeadAssets) -> list[Int[np.ndarray, " R"]]:
     return [rim for rim in found if np.linalg.norm(points[rim].mean(axis=0) - middle) < FACE]
 
 
-def _between_eyes(assets: HeadAssets) -> Float[np.ndarray, 3]:
+def _between_eyes(assets: HeadAssets) -> Float[np.ndarray, " 3"]:
     points = assets.template.double().numpy()
     return (assets.joint_regressor[EYE_JOINTS].double().numpy() @ points).mean(axis=0)

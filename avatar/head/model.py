@@ -107,7 +107,7 @@ class HeadModel:
         """The identity without expression, joints at rest, in metres."""
         return self._identity_shape.clone()
 
-    def neck(self) -> tuple[Float[Tensor, 3], Float[Tensor, " V"]]:
+    def neck(self) -> tuple[Float[Tensor, " 3"], Float[Tensor, " V"]]:
         """The joint of the identity's neck, metres, and which share of the head each vertex is; the rest is torso."""
         return self._identity_joints[NECK].clone(), self._carried(self._weights, NECK)
 

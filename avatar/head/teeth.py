@@ -61,7 +61,7 @@ def with_teeth(assets: HeadAssets) -> HeadAssets:
 def _with_row(
     assets: HeadAssets,
     row: Row,
-    middle: Float[np.ndarray, 3],
+    middle: Float[np.ndarray, " 3"],
     width: float,
     below: float,
     rim: Int[np.ndarray, " R"],
@@ -114,7 +114,7 @@ def _foremost(points: Float[np.ndarray, "V 3"], rim: Int[np.ndarray, " R"]) -> f
     return float(points[near, 2].max(initial=high[2]))
 
 
-def _about(points: Float[np.ndarray, "V 3"], place: Float[np.ndarray, 3]) -> Int[np.ndarray, " C"]:
+def _about(points: Float[np.ndarray, "V 3"], place: Float[np.ndarray, " 3"]) -> Int[np.ndarray, " C"]:
     """The vertices within `AROUND_CHIN` of the one that is nearest to a place."""
     tree = KDTree(points)
     nearest = points[tree.query(place)[1]]

@@ -140,7 +140,7 @@ def fixed_controls(fixed_joints: Collection[str]) -> set[str]:
     return {name for name, joints in joints_of.items() if joints.issubset(fixed_joints)}
 
 
-def turned(about_x: float, about_y: float) -> Float[Tensor, 6]:
+def turned(about_x: float, about_y: float) -> Float[Tensor, " 6"]:
     """6D of a rotation vector (x, y, 0), radians."""
     return axis_angle_to_rotation_matrix(torch.tensor([[about_x, about_y, 0.0]]))[0, :2].reshape(6)
 

@@ -26,7 +26,7 @@ class Backdrop:
     name: str  # as it was asked for
     behind: Float[Tensor, "*size 3"] | None  # a colour [3] or a picture [H, W, 3] in [0, 1]; None: transparent
 
-    def pixels(self, rendering: Rendering, trained: Float[Tensor, 3]) -> UInt8[np.ndarray, "H W C"]:
+    def pixels(self, rendering: Rendering, trained: Float[Tensor, " 3"]) -> UInt8[np.ndarray, "H W C"]:
         """The rendering in place of over the colour `trained`: image + (1 - alpha) (behind - trained). RGB, or RGBA with
         straight alpha where nothing lies behind."""
         image, alpha = rendering.image.detach().cpu(), rendering.alpha.detach().cpu()[..., None]

@@ -47,7 +47,7 @@ class Target(NamedTuple):
 
 
 def targets(
-    frame: Frame, background: Float[Tensor, 3], levels: int, place: HeadPose | None = None
+    frame: Frame, background: Float[Tensor, " 3"], levels: int, place: HeadPose | None = None
 ) -> list[Target] | None:
     """The frame at its own size and at `levels` - 1 halves of it; None where no head is to be seen."""
     picture, mask = frame.composite(background), frame.head_mask
@@ -119,15 +119,15 @@ class FrameFitter:
     """
 
     avatar: Avatar
-    background: Float[Tensor, 3]
-    centre: Float[Tensor, 3]  # that the head turns about, metres
+    background: Float[Tensor, " 3"]
+    centre: Float[Tensor, " 3"]  # that the head turns about, metres
 
     def pictures(self, values: Float[Tensor, " P"], given: HeadPose, targets: Sequence[Target]) -> Pictures:
         """The avatar in the targets' boxes; without a gradient."""
         with torch.no_grad():
             return self._draw(values, given, targets)
 
-    def figures(self, values: Float[Tensor, " P"], given: HeadPose, targets: Sequence[Target]) -> Float[Tensor, 2]:
+    def figures(self, values: Float[Tensor, " P"], given: HeadPose, targets: Sequence[Target]) -> Float[Tensor, " 2"]:
         """Misfit, and PSNR of the head alone in dB, where the avatar is, float64; without a gradient."""
         pictures = self.pictures(values, given, targets)
         return torch.stack((misfit(pictures, targets).double(), head_psnr(pictures, targets)))

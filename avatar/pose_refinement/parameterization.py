@@ -80,7 +80,7 @@ class PoseParameterization:
 
 
 def find_parameterization(
-    tracks: Tracks, train: Sequence[int], centre: Float[Tensor, 3], numbers: Sequence[int] | None = None
+    tracks: Tracks, train: Sequence[int], centre: Float[Tensor, " 3"], numbers: Sequence[int] | None = None
 ) -> PoseParameterization:
     """What may move in a tracking whose frames `train` the avatar was trained on; `centre` of the head, metres.
 

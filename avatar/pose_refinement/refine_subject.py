@@ -67,7 +67,7 @@ def refine_subject(
     avatar: Avatar,
     subject: Subject,
     size: int | None,
-    background: Float[Tensor, 3],
+    background: Float[Tensor, " 3"],
     progress: Path,
     say: Callable[[str], object] = print,
 ) -> Refined | None:
@@ -103,7 +103,7 @@ def refine_subject(
         return None if interrupted() else result
 
 
-def estimated_seconds(avatar: Avatar, subject: Subject, size: int | None, background: Float[Tensor, 3]) -> float:
+def estimated_seconds(avatar: Avatar, subject: Subject, size: int | None, background: Float[Tensor, " 3"]) -> float:
     """About how long `refine_subject` would take, from a few frames; an avatar that has not been trained will do.
 
     Raises UserError as `refine_subject`.
@@ -267,6 +267,6 @@ class _Work:
         for found in self._of_each(frames, lambda frame: self.measure(frame, there[frame])):
             yield [np.nan, np.nan] if found is None else found.tolist()
 
-    def measure(self, frame: int, values: Float[Tensor, " P"]) -> Float[Tensor, 2] | None:
+    def measure(self, frame: int, values: Float[Tensor, " P"]) -> Float[Tensor, " 2"] | None:
         made = self.targets(frame, 1)
         return None if made is None else self.fitter.figures(values, self.pose(frame), made[0])

@@ -74,7 +74,7 @@ def head_params(values: Float[Tensor, " P"]) -> HeadParams:
     return HeadParams(values[EXPRESSION], jaw, torch.cat((left, right)), values[EYELIDS], neck)
 
 
-def moved_pose(values: Float[Tensor, "*B P"], given: HeadPose, centre: Float[Tensor, 3]) -> HeadPose:
+def moved_pose(values: Float[Tensor, "*B P"], given: HeadPose, centre: Float[Tensor, " 3"]) -> HeadPose:
     """The given head pose turned about `centre` (the head's, in its own space, metres) and shifted; differentiable."""
     turn, shift = rotation(values[..., TURN]), values[..., SHIFT]
     pivot = (given.R @ centre) + given.t
@@ -82,7 +82,7 @@ def moved_pose(values: Float[Tensor, "*B P"], given: HeadPose, centre: Float[Ten
 
 
 def moved_tracks(
-    tracks: Tracks, values: Float[Tensor, "T P"], changed: Bool[Tensor, " P"], centre: Float[Tensor, 3]
+    tracks: Tracks, values: Float[Tensor, "T P"], changed: Bool[Tensor, " P"], centre: Float[Tensor, " 3"]
 ) -> dict[str, Tensor]:
     """The tracks with these values; a part of which nothing is `changed` keeps its bits."""
     moved = dict(tracks)
@@ -101,7 +101,7 @@ def moved_tracks(
     return moved
 
 
-def accelerations(tracks: Tracks, values: Float[Tensor, "T P"], centre: Float[Tensor, 3]) -> Float[Tensor, "T P"]:
+def accelerations(tracks: Tracks, values: Float[Tensor, "T P"], centre: Float[Tensor, " 3"]) -> Float[Tensor, "T P"]:
     """Second differences of the given motion over neighbouring frames, float64; zero for the first and the last frame.
 
     Of the pose: how the rotation from frame to frame changes (rotation vectors, camera axes), and of the centre's place.

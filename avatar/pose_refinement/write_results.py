@@ -27,7 +27,7 @@ COLUMNS = ("frame", "name", "part", "psnr_before", "psnr_after", "turn_degrees",
 SHEET_FRAMES = 4  # evenly spread over the held-out ones, besides those that gained most and least
 
 
-def frames_csv(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> str:
+def frames_csv(subject: Subject, refined: Refined, centre: Float[Tensor, " 3"]) -> str:
     """A line for each frame: how well the head fitted before and after (dB), and how far it was turned and shifted. With
     several cameras a line for each time, with the name of the first picture that it was fitted to."""
     turns, shifts = movements(subject.recording.tracks, refined.tracks, centre)
@@ -43,7 +43,7 @@ def frames_csv(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> 
 
 
 def movements(
-    before: Mapping[str, Tensor], after: Mapping[str, Tensor], centre: Float[Tensor, 3]
+    before: Mapping[str, Tensor], after: Mapping[str, Tensor], centre: Float[Tensor, " 3"]
 ) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, " T"]]:
     """How far the head was turned, radians, and its centre was shifted, metres."""
     R = after["R"].double() @ before["R"].double().mT
@@ -53,7 +53,7 @@ def movements(
     return turns.numpy(), (places[1] - places[0]).norm(dim=1).numpy()
 
 
-def summary(subject: Subject, refined: Refined, centre: Float[Tensor, 3]) -> list[str]:
+def summary(subject: Subject, refined: Refined, centre: Float[Tensor, " 3"]) -> list[str]:
     """For people."""
     lines = []
     rows_of, titles = _rows_of_parts(subject.recording), {"train": "training frames", "test": "held-out frames"}

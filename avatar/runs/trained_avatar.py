@@ -59,7 +59,7 @@ class TrainedAvatar:
         return self.avatar.head.assets
 
     @property
-    def background(self) -> Float[Tensor, 3]:
+    def background(self) -> Float[Tensor, " 3"]:
         """The colour that it was trained over."""
         return torch.tensor(self.config.data.background)
 

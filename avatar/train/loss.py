@@ -78,16 +78,16 @@ class TrainingLoss:
     """What a step minimises, for any frame."""
 
     config: TrainerConfig
-    background: Float[Tensor, 3]
+    background: Float[Tensor, " 3"]
     perceptual: PerceptualTerm
 
-    def background_of(self, step: int) -> Float[Tensor, 3]:
+    def background_of(self, step: int) -> Float[Tensor, " 3"]:
         """Behind the head in step `step` (from 0): over one colour alone, Gaussians of that colour cost nothing."""
         every = self.config.opposite_background_every
         return self._opposite if every is not None and step % every == every - 1 else self.background
 
     @cached_property
-    def _opposite(self) -> Float[Tensor, 3]:
+    def _opposite(self) -> Float[Tensor, " 3"]:
         return (self.background < 0.5).to(self.background)
 
     def term(self, step: int) -> Weighted | None:

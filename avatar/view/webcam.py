@@ -125,7 +125,7 @@ def moved_camera(own: Camera, rest: TrackedFace, face: TrackedFace) -> Camera:
     return replace(own, R_cam_world=turn @ own.R_cam_world, t_cam_world=own.t_cam_world + shift)
 
 
-def still_torso(neck: Float[Tensor, 6], own: Camera, moved: Camera) -> Float[Tensor, 6]:
+def still_torso(neck: Float[Tensor, " 6"], own: Camera, moved: Camera) -> Float[Tensor, " 6"]:
     """The neck with which the torso stays as with `neck` before `own` while the head moves."""
     turn = own.R_cam_world.T @ moved.R_cam_world
     return (matrix_from_6d(neck) @ turn.to(neck))[:2].reshape(6)

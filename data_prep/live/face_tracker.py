@@ -40,7 +40,7 @@ class TrackedFace:
 
     params: HeadParams
     R_cam_head: Float[Tensor, "3 3"]  # the head's pose: p_cam = R p_head + t
-    t_cam_head: Float[Tensor, 3]  # metres
+    t_cam_head: Float[Tensor, " 3"]  # metres
     taken: float  # seconds of `time.monotonic`
 
 

@@ -25,7 +25,7 @@ class Pose(NamedTuple):
     """p_to = R p_from + t."""
 
     R: Float[np.ndarray, "3 3"]
-    t: Float[np.ndarray, 3]  # metres
+    t: Float[np.ndarray, " 3"]  # metres
 
     def after(self, other: Pose) -> Pose:
         return Pose(self.R @ other.R, self.R @ other.t + self.t)

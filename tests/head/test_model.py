@@ -111,6 +111,7 @@ def test_a_rotation_in_6d_is_orthonormal_and_its_first_rows_are_the_input() -> N
     assert torch.equal(matrix_from_6d(torch.tensor(IDENTITY_6D)), torch.eye(3))
 
 
+@pytest.mark.usefixtures("any_shapes")
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -36,8 +36,8 @@ class View(NamedTuple):
     """One camera from the front camera's axes, and what was found in its pictures."""
 
     R: Float[np.ndarray, "3 3"]
-    t: Float[np.ndarray, 3]  # in the calibration's unit
-    intrinsics: Float[np.ndarray, 4]  # fx, fy, cx, cy in pixels
+    t: Float[np.ndarray, " 3"]  # in the calibration's unit
+    intrinsics: Float[np.ndarray, " 4"]  # fx, fy, cx, cy in pixels
     found: Float[np.ndarray, "T L 2"]  # pixels; NaN where no face was found
 
 
@@ -58,7 +58,7 @@ class Placement(NamedTuple):
     after: float
     cameras: tuple[str, ...]  # that were used
 
-    def moved(self, row: int, track: FrameTrack, centre: Float[np.ndarray, 3]) -> FrameTrack:
+    def moved(self, row: int, track: FrameTrack, centre: Float[np.ndarray, " 3"]) -> FrameTrack:
         """The head before the front camera at one time; it turns about `centre`, the landmarks' mean."""
         R = track.R @ self.turn
         return replace(track, R=R, t=centre + R @ track.R.T @ (track.t - centre) + self.shifts[row])

@@ -26,7 +26,7 @@ class Smoothness:
 
     head_points: Float[Tensor, "4 3"]  # in the head's space, metres
     follows: Float[Tensor, " T"]  # 1 where a frame comes right after the one before it
-    pose: Float[Tensor, 3]  # 1 / deviation
+    pose: Float[Tensor, " 3"]  # 1 / deviation
     first: Float[Tensor, " C"]  # 1 / variance, of all columns but the pose
     second: Float[Tensor, " C"]
 
