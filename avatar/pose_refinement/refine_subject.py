@@ -246,7 +246,8 @@ class _Work:
         numbers = np.array(self.numbers)
         trained_on = torch.zeros(len(moves), dtype=torch.bool)
         trained_on[self.train] = True
-        for part in (trained_on, ~trained_on):  # apart: no training frame may follow a held-out one
+        seen = torch.from_numpy(~np.isnan(before[:, 0]))  # others have no moves to tie their neighbours to
+        for part in (trained_on & seen, ~trained_on & seen):  # apart: no training frame may follow a held-out one
             given, own_numbers = parameterization.acceleration[part], numbers[part.numpy()]
             moves[part] = smoothed(moves[part], matrix, given, parameterization.calm, own_numbers)
         values = parameterization.all_values(moves)
