@@ -91,7 +91,8 @@ def refine_subject(
                 moves.append(found.moves)
                 figures.append(found.figures)
                 bar.update(1)
-                bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)[1:]), refresh=False)
+                if not np.isnan(figures).all():  # none, where no frame so far shows a head
+                    bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)[1:]), refresh=False)
                 stops = interrupted()  # asked once: what is saved for it is done, too
                 if len(moves) % SAVE_EVERY == 0 or stops:
                     write_progress(progress, key, moves, figures)
