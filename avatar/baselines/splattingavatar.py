@@ -25,6 +25,7 @@ class SplattingAvatar(UVAvatar):
         *("upsampling", "latent_dim", "latent_grid", "mlp_width", "mlp_layers"),
         *("skull_binding", "head_rotation"),
     )
+    trained_without = ("condition_noise",)
 
     def __init__(self, assets: HeadAssets, identity: Float[Tensor, " S"], config: ModelConfig) -> None:
         super().__init__(assets, identity, config)

@@ -83,6 +83,10 @@ class Recording:
             return self.cameras[self.view(index)].image_size(size)
         return max((one.image_size(size) for one in self.cameras), key=lambda both: both[0] * both[1])
 
+    def smallest_size(self, size: int | None = None) -> tuple[int, int]:
+        """`image_size` of the camera whose shorter side is the least."""
+        return min((one.image_size(size) for one in self.cameras), key=min)
+
     def camera(self, index: int, size: int | None = None) -> Camera:
         """The camera of a frame; it holds the head's pose."""
         if self.rig is None:

@@ -263,7 +263,7 @@ def background_notes(protocols: Sequence[Protocol], run: Run) -> list[str]:
     trained, notes = run.config.data.background, []
     over = {tuple(trained)}
     if run.config.trainer.opposite_background_every and run.avatar.has_colours:
-        over.add(tuple(1.0 - value for value in trained))
+        over.add(tuple(float(value < 0.5) for value in trained))
     for background in dict.fromkeys(protocol.background for protocol in protocols):
         if background not in over:
             names = [protocol.name for protocol in protocols if protocol.background == background]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import torch
@@ -25,7 +25,7 @@ from torch.nn.functional import interpolate, max_pool2d, normalize
 
 from avatar.compute.device import to_device
 from avatar.compute.memory import Need
-from avatar.config import Initialization, ModelConfig, TrainerConfig
+from avatar.config import Initialization, LearningRates, ModelConfig, TrainerConfig
 from avatar.data.frame import Frame
 from avatar.gaussianheadavatar.hyper_sets import Attributes
 from avatar.gaussianheadavatar.initial_gaussians import initial_gaussians
@@ -64,6 +64,7 @@ class GaussianHeadAvatar(Avatar):
     has_colours = False
     unknown_to_browsers = "its upsampling network"
     without_effect = *WITHOUT_EFFECT, "latent_dim"
+    trained_without = "opposite_background_every", *(f"learning_rates.{rate.name}" for rate in fields(LearningRates))
     has_surface = True
     initial_frames = 48
     centre: Tensor  # of the head at rest, metres

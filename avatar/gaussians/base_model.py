@@ -43,6 +43,7 @@ class Avatar(nn.Module):
     unknown_to_browsers: str | None = "this model"  # why it cannot be exported for browsers; None: it can
     has_colours = True  # whether each Gaussian has a colour; else `draw` makes colours of features
     without_effect: tuple[str, ...] = ("upsampling",)  # keys of `ModelConfig` that this model does not read
+    trained_without: tuple[str, ...] = ()  # keys of `TrainerConfig` that change nothing in its training
     has_surface = False  # whether points can start on a surface that is fitted to training frames
     initial_frames = 16  # that `initialize_from` gets, evenly spread over the training frames
     turning: Tensor | None  # of `avatar.gaussians.head_rotation`; zeros until `learn_head_rotation`

@@ -62,7 +62,7 @@ def fit_expressions(training: Sequence[HeadParams]) -> ExpressionSpace:
     deviations = deviations.clamp(min=LEAST_DEVIATION * largest)
     scores = centred @ components.T
     own = _mahalanobis(centred, components, deviations)
-    far = max(float(torch.quantile(own, FAR_PERCENTILE)), 1e-6)
+    far = float(torch.quantile(own, FAR_PERCENTILE)) or 1.0
     return ExpressionSpace(mean, components, deviations, scores.amin(dim=0), scores.amax(dim=0), far)
 
 

@@ -37,7 +37,8 @@ def estimate_training(source: Source, overrides: list[str], rounds: int, device:
     check_divided(subject.split)
     config, size = config_for_subject(config, subject), subject.image_size(config.data.size)
     frames = len(subject.split.train)
-    perceptual = choose_perceptual(config.trainer, print, size=size, device=chosen)
+    smallest = subject.recording.smallest_size(config.data.size)
+    perceptual = choose_perceptual(config.trainer, print, size=smallest, device=chosen)
     needs = training_needs(config, assets, frames=frames, size=size, perceptual=perceptual.name)
     available = free_bytes(chosen) or available_bytes()  # before the steps, whose memory stays
     check_memory("training", needs, available)

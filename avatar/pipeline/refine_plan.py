@@ -128,7 +128,7 @@ def steps_in_time(
         minutes is None or choose_device(config.device, lambda _: None) != CPU
     ):  # what a GPU takes, the first round shows
         return asked, round_steps(asked, frames)
-    term = choose_perceptual(config.trainer, lambda _: None, size=subject.image_size(config.data.size))
+    term = choose_perceptual(config.trainer, lambda _: None, size=subject.recording.smallest_size(config.data.size))
     avatar = new_avatar(assets, subject, config, term.name, CPU)
     refinement = estimated_seconds(avatar, subject, config.data.size, torch.tensor(config.data.background))
     frame = subject.frame(subject.split.train[0], config.data.size)

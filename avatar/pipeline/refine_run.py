@@ -13,7 +13,7 @@ from avatar.data.refinement_history import Refinement, Round
 from avatar.files.names import shortened
 from avatar.pipeline import INTERRUPTED, OK
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.refine_plan import FIRST_PASSES
+from avatar.pipeline.refine_plan import FIRST_PASSES, round_steps
 from avatar.pose_refinement.refine_subject import fingerprint, refine_subject
 from avatar.pose_refinement.write_results import frames_csv, sheet, summary
 from avatar.runs.model_registry import refuse_features
@@ -58,10 +58,12 @@ def refine_run(run: Run, target: Path, device: str | None = None) -> int:
     print(f"Subject      {target}")
     print(f"Frames       {target / 'refinement.csv'}")
     print(f"Pictures     {target / 'refinement.png'}")
-    if (passes := run.step / max(len(subject.split.train), 1)) > MANY_PASSES:
+    frames = len(subject.split.train)
+    passes, usual = run.step / frames, round_steps(run.step, frames) / frames
+    if passes > max(MANY_PASSES, usual):
         print(
             f"Note: this avatar was trained for {passes:.0f} passes over the frames and may overfit the tracking's errors; "
-            f"avatar train --refine 1 refines through one trained for {FIRST_PASSES} passes, often better"
+            f"avatar train --refine 1 refines through one trained for {usual:.0f} passes, often better"
         )
     return OK
 

@@ -49,7 +49,7 @@ def train_new(source: Source, overrides: list[str], run: Path, device: str | Non
         subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
         check_divided(subject.split)
         config = config_for_subject(config, subject)
-        size = subject.image_size(config.data.size)
+        size = subject.recording.smallest_size(config.data.size)
         perceptual = choose_perceptual(config.trainer, print, size=size, device=chosen)
         avatar = new_avatar(assets, subject, config, perceptual.name, chosen)
         start_run(run, source, config, subject, perceptual.name, chosen_options(overrides))
@@ -95,7 +95,7 @@ def continue_training(
         return OK
     if (before := checkpoint.meta.get("device", "cpu")) != chosen.type:
         print(f"Note: the checkpoint was made on {before}, this is {chosen.type}; {OTHER_ROUNDING}")
-    size = subject.image_size(config.data.size)
+    size = subject.recording.smallest_size(config.data.size)
     perceptual = choose_perceptual(config.trainer, print, recorded=info.perceptual, size=size, device=chosen)
     print(f"Resuming {run} at step {checkpoint.step} of {config.trainer.iterations}")
     return finish_training(avatar, subject, config, run, perceptual, chosen, checkpoint)

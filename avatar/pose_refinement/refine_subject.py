@@ -91,7 +91,8 @@ def refine_subject(
                 moves.append(found.moves)
                 figures.append(found.figures)
                 bar.update(1)
-                bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)[1:]), refresh=False)
+                if not np.isnan(figures).all():  # none, where no frame so far shows a head
+                    bar.set_postfix_str("PSNR {:.2f} -> {:.2f}".format(*np.nanmean(figures, axis=0)[1:]), refresh=False)
                 stops = interrupted()  # asked once: what is saved for it is done, too
                 if len(moves) % SAVE_EVERY == 0 or stops:
                     write_progress(progress, key, moves, figures)
@@ -246,7 +247,8 @@ class _Work:
         numbers = np.array(self.numbers)
         trained_on = torch.zeros(len(moves), dtype=torch.bool)
         trained_on[self.train] = True
-        for part in (trained_on, ~trained_on):  # apart: no training frame may follow a held-out one
+        seen = torch.from_numpy(~np.isnan(before[:, 0]))  # others have no moves to tie their neighbours to
+        for part in (trained_on & seen, ~trained_on & seen):  # apart: no training frame may follow a held-out one
             given, own_numbers = parameterization.acceleration[part], numbers[part.numpy()]
             moves[part] = smoothed(moves[part], matrix, given, parameterization.calm, own_numbers)
         values = parameterization.all_values(moves)

@@ -44,6 +44,7 @@ def refuse_features(config: ModelConfig, what: str) -> None:
 def keys_without_effect(overrides: Sequence[str], name: str) -> list[str]:
     """Those keys among the overrides that the model `name` does not read."""
     unread = {f"model.{key}" for key in MODELS[name].without_effect}
+    unread |= {f"trainer.{key}" for key in MODELS[name].trained_without}
     return [key for override in overrides if (key := override.partition("=")[0]) in unread]
 
 

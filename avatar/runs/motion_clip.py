@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from avatar.data.recording import Recording
@@ -59,5 +59,7 @@ def driven_clip(trained: TrainedAvatar, drive: Drive, size: int | None = None) -
     """A drive as the avatar shows it: relative to both neutral faces, as `avatar reenact` does by default."""
     head = HeadModel(trained.assets, drive.identity)
     moved = transfer_motion(drive.params, trained.statistics, "relative", head).motion
+    if drive.cameras is None:  # the torso would turn against a head that does not
+        moved = [replace(params, neck=trained.rest_params().neck) for params in moved]
     cameras = choose_cameras(drive, trained.rest_camera(size), "driver", "target")
     return Clip(drive.name, drive.fps, list(zip(moved, cameras, strict=True)))

@@ -47,7 +47,7 @@ def measure_cost(frame: Frame, subject: Subject, assets: HeadAssets, config: Con
     start_seconds = time.perf_counter() - begin
     corrections = make_pose_corrections(avatar, [frame.time], config.trainer)
     optimizer = make_optimizer(avatar, config.trainer, corrections)
-    size = frame.camera.width, frame.camera.height
+    size = subject.recording.smallest_size(config.data.size)
     term = choose_perceptual(config.trainer, lambda _: None, size=size)
     objective = TrainingLoss(config.trainer, torch.tensor(config.data.background), term)
     steps = StepRunner(TrainState(avatar, optimizer, objective, corrections))

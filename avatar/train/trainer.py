@@ -86,8 +86,8 @@ def train(
         tensors = module_tensors(avatar) | optimizer_tensors(optimizer, state.named_parameters())
         if corrections is not None:
             tensors[f"{PREFIX}moves"] = corrections.moves.detach()
+        log.save()  # first: a resumed run has the curves up to its checkpoint, and leaves out what comes after
         save_checkpoint(run / "checkpoints", Checkpoint(step, tensors, meta))
-        log.save()
         write_avatar(run / AVATAR_FILE, avatar, config, recording, neutral, step, perceptual.name)
 
     frame_cache = GpuFrameCache(subject, device, frame_cache_bytes(device)) if is_gpu else None

@@ -121,6 +121,23 @@ def test_results_name_every_choice(tmp_path: Path, subject: Subject) -> None:
         assert f"\n{name}" in table and f"{results['protocols'][name]['means']['psnr']:.2f}" in table
 
 
+@pytest.mark.parametrize(
+    ("background", "noted"),
+    [
+        ((0.5, 0.5, 0.5), ["flashavatar", "hypergaussians and strict"]),
+        ((0.7, 0.2, 0.9), ["hypergaussians and strict", "rgbavatar"]),
+    ],
+)
+def test_the_opposite_of_any_background_was_trained_over(
+    background: tuple[float, ...], noted: list[str], tmp_path: Path, subject: Subject
+) -> None:
+    """As training has it: 0 or 1 in each channel. The opposite of grey is black."""
+    run = make_run(tmp_path / "run", subject)
+    run.config.data.background, run.config.trainer.opposite_background_every = background, 3
+    protocols = choose_protocols(["hypergaussians", "flashavatar", "rgbavatar", "strict"])
+    assert sorted(note.partition(":")[0] for note in notes_of(protocols, run) if "drawn over" in note) == noted
+
+
 def test_video_shows_every_frame(tmp_path: Path, subject: Subject) -> None:
     run = make_run(tmp_path / "run", subject)
     evaluate(run, ["hypergaussians"], say=lambda _: None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import get_args, get_type_hints
 
@@ -12,7 +12,7 @@ from heads import grid_head, random_params
 from small_runs import small_config
 from tracked_folder import write_head_model
 
-from avatar.config import ModelConfig
+from avatar.config import LearningRates, ModelConfig, TrainerConfig, declared_keys
 from avatar.runs.model_registry import MODELS, keys_without_effect, make_avatar
 
 
@@ -55,3 +55,31 @@ def test_keys_without_effect_are_all_that_change_nothing(model: str, tmp_path: P
     assert same == set(MODELS[model].without_effect)
     overrides = [f"model={model}", *(f"model.{key}={value}" for key, value in other.items())]
     assert keys_without_effect(overrides, model) == [f"model.{key}" for key in other if key in same]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_keys_of_the_training_that_change_nothing_are_named(model: str) -> None:
+    config = small_config(f"model={model}")
+    avatar = make_avatar(grid_head(), torch.zeros(3), config.model)
+
+    def rates(trainer: TrainerConfig) -> list[float]:
+        return [rate for _, rate in avatar.parameter_groups(trainer).values()]
+
+    rate_names = [field.name for field in fields(LearningRates)]
+    others = {name: replace(config.trainer.learning_rates, **{name: 0.5}) for name in rate_names}
+    alike = [
+        name
+        for name, own in others.items()
+        if rates(replace(config.trainer, learning_rates=own)) == rates(config.trainer)
+    ]
+    expected = [f"trainer.learning_rates.{name}" for name in alike]
+    expected += [] if avatar.has_colours else ["trainer.opposite_background_every"]
+    with torch.no_grad():  # what is new does not follow the expression
+        for parameter in avatar.parameters():
+            parameter += 0.05 * torch.randn_like(parameter)
+    params = random_params()
+    noisy, vertices = params.with_condition(params.condition() + 1.0), avatar.vertices(params)
+    if all(torch.equal(a, b) for a, b in zip(avatar(params, vertices), avatar(noisy, vertices), strict=True)):
+        expected.append("trainer.condition_noise")
+    named = keys_without_effect([f"{key}=1" for key in declared_keys()], model)
+    assert sorted(key for key in named if key.startswith("trainer.")) == sorted(expected)

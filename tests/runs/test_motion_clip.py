@@ -1,17 +1,24 @@
-"""Frames of an avatar's own video as a film."""
+"""Frames of an avatar's own video, and others' motion, as a film."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
+import torch
 from drawn_clip import true_tracks
+from small_runs import train_small
 
 from avatar.data.camera_rig import CameraRig, RigCamera
 from avatar.data.recording import Recording
 from avatar.data.split import Split
-from avatar.runs.motion_clip import own_clip
-from avatar.runs.trained_avatar import TrainedAvatar
+from avatar.motion.controls import turned
+from avatar.motion.drive import Drive
+from avatar.runs.avatar_file import AVATAR_FILE
+from avatar.runs.motion_clip import driven_clip, own_clip
+from avatar.runs.trained_avatar import TrainedAvatar, load_avatar
 
 
 def filmed_by_two(test: tuple[int, ...]) -> TrainedAvatar:
@@ -49,3 +56,17 @@ def test_a_film_of_held_out_frames_is_of_one_camera() -> None:
 
 def test_a_time_that_the_camera_did_not_film_is_seen_by_another() -> None:
     assert own_clip(filmed_by_two((2, 5, 7, 9)), "test").recorded == (2, 5, 7, 9)
+
+
+def test_before_a_camera_that_stands_still_the_torso_does_too(tracked_folder: Path, tmp_path: Path) -> None:
+    """As `avatar reenact` shows it: the head's own turns are not known, and the torso alone would turn beneath it."""
+    train_small(tracked_folder, tmp_path)
+    trained = load_avatar(tmp_path / AVATAR_FILE, tracked_folder / "head_model")
+    recording = trained.recording
+    params = [replace(recording.params(i), neck=turned(0.1 * i, 0.2)) for i in range(3)]
+    still = Drive("someone", 25.0, ("0", "1", "2"), params, None, recording.identity)
+    assert all(torch.equal(p.neck, trained.rest_params().neck) for p, _ in driven_clip(trained, still).frames)
+    moving = replace(still, cameras=[recording.camera(i) for i in range(3)])
+    assert all(
+        torch.equal(p.neck, q.neck) for (p, _), q in zip(driven_clip(trained, moving).frames, params, strict=True)
+    )

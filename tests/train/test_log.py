@@ -1,16 +1,19 @@
-"""What the progress bar shows, and previews."""
+"""What the progress bar shows, previews and curves."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from small_runs import train_small
 
 from avatar.errors import UserError
 from avatar.losses.photometric import PhotometricLoss
-from avatar.runs.checkpoint import newest_checkpoint
+from avatar.runs.checkpoint import Checkpoint, newest_checkpoint, save_checkpoint
+from avatar.runs.training_curves import read_curves
+from avatar.train import trainer as trainer_module
 from avatar.train.log import TrainingLog
 
 
@@ -37,3 +40,20 @@ def test_a_preview_that_cannot_be_written_costs_no_checkpoint(
     with pytest.raises(UserError, match="no space"):
         train_small(tracked_folder, tmp_path / "run")
     assert newest_checkpoint(tmp_path / "run").step == 4
+
+
+def test_a_kill_after_a_checkpoint_costs_no_point_of_the_curves(
+    tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(folder: Path, checkpoint: Checkpoint) -> None:
+        save_checkpoint(folder, checkpoint)
+        if checkpoint.step == 12:
+            raise KeyboardInterrupt
+
+    train_small(tracked_folder, tmp_path / "whole")
+    monkeypatch.setattr(trainer_module, "save_checkpoint", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train_small(tracked_folder, tmp_path / "killed")
+    assert newest_checkpoint(tmp_path / "killed").step == 12
+    curves = read_curves(tmp_path / "whole")
+    assert curves[-1, 0] == 12 and np.array_equal(read_curves(tmp_path / "killed"), curves)

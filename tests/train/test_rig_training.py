@@ -8,9 +8,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import pytest
 import torch
-from camera_rig_folder import write_single
+from camera_rig_folder import edited, write_single
 from small_runs import SMALL
 
 from avatar.cli import main
@@ -55,6 +56,22 @@ def test_steps_of_cameras_with_different_lenses_are_not_replayed_by_one_graph(pl
     inputs: Any = [SimpleNamespace(frame=SimpleNamespace(camera=c), crop_rows=None, crop_columns=None) for c in cameras]
     kinds = {Kind.of(0, one, None) for one in inputs}
     assert len(kinds) == len({c.cx for c in cameras}) == 2 and len({kind.size for kind in kinds}) == 1
+
+
+@pytest.mark.parametrize("option", [[], ["--dry-run"]])
+def test_pictures_of_one_camera_that_are_too_small_are_refused_before_training(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: list[str]
+) -> None:
+    def widened(entry: dict[str, Any]) -> None:
+        if entry["camera_id"] == "12":
+            entry |= {key: 4 * entry[key] for key in ("w", "fl_x", "cx")}
+
+    folder = edited(place / "EMO", tmp_path / "wide", widened)
+    for path in folder.glob("*/*_12.png"):
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), None, fx=4, fy=1))
+    words = ["train", str(folder), "--out", str(tmp_path / "run"), *options(place), "data.size=16", *option]
+    assert main(words) == 1
+    assert "needs frames of at least 11x11 pixels, these have 16x4" in capsys.readouterr().err
 
 
 def test_the_avatar_file_holds_the_rig(place: Path) -> None:
