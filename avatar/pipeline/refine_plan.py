@@ -124,9 +124,8 @@ def steps_in_time(
     subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
     frames = len(subject.split.train)
     asked = within_epochs(config.trainer, frames).iterations
-    if (
-        minutes is None or choose_device(config.device, lambda _: None) != CPU
-    ):  # what a GPU takes, the first round shows
+    # What a GPU takes, the first round shows.
+    if minutes is None or choose_device(config.device, lambda _: None) != CPU:
         return asked, round_steps(asked, frames)
     term = choose_perceptual(config.trainer, lambda _: None, size=subject.recording.smallest_size(config.data.size))
     avatar = new_avatar(assets, subject, config, term.name, CPU)
