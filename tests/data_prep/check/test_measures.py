@@ -77,11 +77,15 @@ def test_a_frame_is_compared_with_its_neighbours_in_time() -> None:
     assert np.isnan(gap.rotation).tolist() == [True, False, True, True, False, True]
 
 
-@pytest.mark.parametrize(("level", "changes"), [(100.0, 1), (1.0, 0)])
-def test_light_that_changes_is_told_where_there_is_light(level: float, changes: int) -> None:
-    """Pictures that are black have no light that could change."""
-    colours = [np.full(3, level * (1 if n < 30 else 2)) for n in range(60)]
-    views = {n: SimpleNamespace(head_colour=colour, background_colour=None) for n, colour in enumerate(colours)}
+@pytest.mark.parametrize(
+    ("level", "behind", "changes"), [(100.0, None, 1), (1.0, None, 0), (100.0, 2.0, 1), (100.0, 1.0, 0), (100.0, 0.5, 0)]
+)
+def test_light_that_changes_is_told_where_there_is_light(level: float, behind: float | None, changes: int) -> None:
+    """Pictures that are black have no light that could change; a lamp on the head alone is not the camera's exposure."""
+    views = {}
+    for n in range(60):
+        background = None if behind is None else np.full(3, 60.0 * (1 if n < 30 else behind))
+        views[n] = SimpleNamespace(head_colour=np.full(3, level * (1 + (n >= 30))), background_colour=background)
     read: Any = SimpleNamespace(views=views, name=str, names=tuple, files=SimpleNamespace(images={}, alphas={}))
     assert len(list(_exposure(read))) == changes
 
