@@ -244,7 +244,7 @@ def test_what_prepare_refuses_is_an_error_and_nothing_stops_the_check(case: str,
     CASES[case][0](folder)
     check = checked(folder, offset=None)
     errors = {finding.check for finding in check.findings if finding.severity == "error"}
-    assert check.status == 2 and errors and ("left-out" not in errors or len(errors) == 1)  # small losses are told by themselves
+    assert check.status == 2 and errors and ("left-out" not in errors or len(errors) == 1)  # small losses apart
 
 
 def test_a_number_that_training_refuses_is_an_error(good_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
