@@ -34,6 +34,10 @@ def test_plan_survives_a_round_trip(tmp_path: Path) -> None:
     made = refine_plan.Plan(1, Source(tmp_path, tmp_path / "head_model"), ("data.size=64",), None, 1000, 77)
     made.save(tmp_path)
     assert refine_plan.Plan.load(tmp_path) == made
+    content = json.loads(refine_plan.plan_file(tmp_path).read_text())
+    refine_plan.plan_file(tmp_path).write_text(json.dumps(content | {"format": 1}))
+    with pytest.raises(UserError, match="another version of this program"):
+        refine_plan.Plan.load(tmp_path)
 
 
 @pytest.mark.parametrize(
