@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,13 +10,17 @@ import numpy as np
 import pytest
 from some_tracks import track
 
+from avatar.data.source import Source
 from avatar.data.split import Split
+from data_prep.check import clip as clip_module
 from data_prep.check import plots
 from data_prep.check.check_images import _exposure
 from data_prep.check.check_tracking import _camera
+from data_prep.check.clip import Clip
 from data_prep.check.coverage import Coverage, measure_coverage
 from data_prep.check.head_angles import head_angles, measure_jumps
-from data_prep.formats.frame_track import FrameTrack
+from data_prep.formats.frame_track import FrameTrack, Tracking
+from data_prep.prepare.frame_offset import OffsetEstimate
 
 TRAIN, TEST = 20, 5
 
@@ -110,3 +115,18 @@ def test_what_is_shaded_is_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
     spans = [patch.get_extents().transformed(figure.axes[0].transData.inverted()) for patch in figure.axes[0].patches]
     shaded = [number for number in images if any(span.x0 < number < span.x1 for span in spans)]
     assert shaded == [images[place] for place in test]
+
+
+def test_the_ends_of_a_clip_are_compared_where_both_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
+    def parts(*found: int | str) -> tuple[int, int] | None:
+        each = iter(one if isinstance(one, str) else OffsetEstimate(one, 9.0, 0, 60, False) for one in found)
+        monkeypatch.setattr(clip_module, "_estimate", lambda *_: next(each))
+        numbers: Any = dict.fromkeys(range(3 * clip_module.MIN_PART))
+        nothing: Any = None
+        read = Clip(Source(Path(), Path()), nothing, Tracking(numbers, {}, [], {}), (), (), None, None, "", None)
+        done = clip_module._with_offset(read, nothing)
+        assert done.offset == (None if found[2] == "unclear" else found[2])
+        return done.part_offsets
+
+    assert parts(1, 2, 1) == (1, 2)
+    assert parts(1, "unclear", 1) is None and parts("unclear", 1, "unclear") is None
