@@ -50,7 +50,8 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
     sources = re.findall(r'src="([^"]{0,30})', page)
     assert len(sources) == 6 + 2 + 2  # held-out frames; curves and worst of the evaluation; training
     assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in sources)
-    assert f"<h1>Run {run.parent.name}</h1>" in page and "<dd>someone</dd>" in page
+    assert means_table(results["protocols"]) in page and page.count("<details><summary>The ") == 2
+    assert f"<header><h1>Run {run.parent.name}</h1>" in page and "<dd>someone</dd>" in page
     assert str(run.parent.parent) not in page, "where this machine keeps its files concerns nobody else"
     assert results["data_hash"] in page and "trainer.learning_rates.scale" in page
     assert len(page) < 8e6
