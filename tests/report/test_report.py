@@ -21,7 +21,7 @@ from tracked_folder import write_tracked_folder
 from avatar.cli import main
 from avatar.errors import UserError
 from avatar.pipeline.open_inputs import open_run
-from avatar.report.page import _curves, _figures, bins_tables, means_table, render_report
+from avatar.report.page import _curves, _figures, _origin, bins_tables, means_table, render_report
 from avatar.runs.training_curves import read_curves
 from avatar.sweep.results import fold_results
 from avatar.sweep.spec import Job, Resources, Spec
@@ -54,6 +54,7 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
     assert f"<header><h1>Run {run.parent.name}</h1>" in page and "<dd>someone</dd>" in page
     assert str(run.parent.parent) not in page, "where this machine keeps its files concerns nobody else"
     assert results["data_hash"] in page and "trainer.learning_rates.scale" in page
+    assert 'id="frame" min="0" max="5" value="0"' in page
     assert len(page) < 8e6
 
 
@@ -92,6 +93,7 @@ def test_a_round_of_refinement_is_named_without_the_machines_folders(run: Path) 
     results = json.loads((run / "eval" / "results.json").read_text())
     assert "Measured at step" not in "".join(_figures(opened, results))
     assert "Measured at step 7, while the newest" in "".join(_figures(opened, results | {"step": 7}))
+    assert "<p>a note</p>" in "".join(_origin(opened, results | {"notes": ["a note"]}))
     one = {"run": "/home/me/films/me/run/rounds/1/run", "step": 9}
     one |= {"frames_trained_on": 3, "measured_frames_trained_on": 0}
     results["tracking"] |= {"refined": "through the avatar of another run", "rounds": [one]}
