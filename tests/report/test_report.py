@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from access import audited
 from browsers import chromium
 from small_runs import train_small
@@ -22,9 +23,11 @@ from avatar.cli import main
 from avatar.errors import UserError
 from avatar.pipeline.open_inputs import open_run
 from avatar.report.page import _curves, _figures, _origin, bins_tables, means_table, render_report
+from avatar.report.pictures import frame_panels
 from avatar.runs.training_curves import read_curves
 from avatar.sweep.results import fold_results
 from avatar.sweep.spec import Job, Resources, Spec
+from avatar.tensors import to_8_bit
 
 LOADED = "[[...document.images].filter((one) => one.naturalWidth > 0).length, document.images.length]"
 
@@ -63,6 +66,14 @@ def test_the_avatars_page_beside_a_run_is_linked(run: Path, tmp_path: Path) -> N
     assert link in (run / "report.html").read_text(encoding="utf-8")
     alone = shutil.copytree(run, tmp_path / "run")
     assert link not in render_report(open_run(alone))
+
+
+def test_the_truth_is_on_the_left(run: Path) -> None:
+    opened = open_run(run)
+    name, image = frame_panels(opened)[0]
+    frame = opened.subject.frame(opened.subject.split.test[0], opened.config.data.size)
+    truth = to_8_bit(frame.composite(torch.tensor(opened.config.data.background))).numpy()
+    assert name == frame.name and np.array_equal(image[-len(truth) :, : truth.shape[1]], truth)
 
 
 def test_curves_are_those_that_training_recorded(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
