@@ -74,6 +74,7 @@ def test_the_truth_is_on_the_left(run: Path) -> None:
     frame = opened.subject.frame(opened.subject.split.test[0], opened.config.data.size)
     truth = to_8_bit(frame.composite(torch.tensor(opened.config.data.background))).numpy()
     assert name == frame.name and np.array_equal(image[-len(truth) :, : truth.shape[1]], truth)
+    assert image[-len(truth) :, truth.shape[1] : 2 * truth.shape[1]].std() > 5, "and a picture beside it"
 
 
 def test_curves_are_those_that_training_recorded(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,13 +12,16 @@ from some_tracks import track
 
 from avatar.data.source import Source
 from avatar.data.split import Split
+from avatar.errors import UserError
 from data_prep.check import clip as clip_module
 from data_prep.check import plots
 from data_prep.check.check_images import _exposure
 from data_prep.check.check_tracking import _camera
 from data_prep.check.clip import Clip
 from data_prep.check.coverage import Coverage, measure_coverage
+from data_prep.check.examine_image import look_at, measure_matte
 from data_prep.check.head_angles import head_angles, measure_jumps
+from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE
 from data_prep.formats.frame_track import FrameTrack, Tracking
 from data_prep.prepare.frame_offset import OffsetEstimate
 
@@ -80,6 +83,25 @@ def test_a_frame_is_compared_with_its_neighbours_in_time() -> None:
     np.testing.assert_allclose(found.translation, [np.nan, 0.0, 5.0, 10.0, 5.0, np.nan], atol=1e-4)
     gap = measure_jumps([0, 1, 2, 4, 5, 6], tracks)
     assert np.isnan(gap.rotation).tolist() == [True, False, True, True, False, True]
+
+
+def test_a_matte_that_cannot_be_read_is_not_measured(tmp_path: Path) -> None:
+    (tmp_path / "any").write_bytes(b"")
+
+    def decode(kind: str, _: bytes, path: Path) -> np.ndarray:
+        if kind == ALPHA:
+            raise UserError(f"{path} is damaged")
+        return np.full((64, 64, 3) if kind == IMAGE else (64, 64), 200, np.uint8)
+
+    whole = {IMAGE: tmp_path / "any", HEAD: tmp_path / "any"}
+    matte = look_at(whole, decode).matte
+    assert matte is not None and (matte.covered, matte.haze, matte.holes, matte.specks) == (1.0, 0.0, 0.0, 0.0)
+    assert look_at(whole | {ALPHA: tmp_path / "any"}, decode).matte is None
+    thin, head = np.full((64, 64), 51, np.uint8), np.full((64, 64), 255, np.uint8)
+    thin[:16, :16] = 255
+    found = measure_matte(thin, head, thin > 127)
+    assert (found.covered, found.haze) == pytest.approx((1 / 16, 0.2))
+    assert measure_matte(thin // 4, head, thin > 255).haze == pytest.approx((15 * 12 + 63) / 16 / 255), "nobody at all"
 
 
 @pytest.mark.parametrize(
