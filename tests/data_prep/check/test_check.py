@@ -293,7 +293,7 @@ def test_json_is_all_of_stdout_and_the_status_is_that_of_the_findings(
     all_zero(5)(folder)
     assert main(["check", str(folder), "--frame-offset", "1", "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
-    assert report["exit_status"] == 1 and report["facts"]["frame offset"] == 1
+    assert report["exit_status"] == 1 and report["facts"]["frame offset"] == 1 and "field of view" in report["facts"]
     assert {"severity": "warning", "check": "no-face"}.items() <= report["findings"][0].items()
     assert main(["check", str(folder / "nowhere"), "--json"]) == 2
     (only,) = json.loads(capsys.readouterr().out)["findings"]
