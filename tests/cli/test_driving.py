@@ -132,7 +132,11 @@ def test_the_torso_turns_against_no_head_that_does_not_turn(
 
     monkeypatch.setattr(type(trained), "stream", stream)
     own = trained.rest_params().neck
-    for given, whose, expected in ((cameras, "driver", necks), (cameras, "target", [own] * 3), (None, "driver", [own] * 3)):
+    for given, whose, expected in (
+        (cameras, "driver", necks),
+        (cameras, "target", [own] * 3),
+        (None, "driver", [own] * 3),
+    ):
         drive = Drive("a", 10.0, ("1", "2", "3"), params, given, torch.zeros(0))
         shown.clear()
         reenact(trained, drive, tmp_path / "a.mp4", Choices(transfer="raw", camera=whose))

@@ -72,7 +72,9 @@ def test_a_variant_with_a_job_that_saw_measured_frames_is_marked_and_mixed_terms
 
 def test_intervals_know_how_few_trainings_there_are() -> None:
     assert interval(np.array([1.0])) is None
-    assert interval(np.array([1.0, 3.0])) == pytest.approx((2 - 12.706, 2 + 12.706), abs=1e-3)  # of tables of Student's t
+    assert interval(np.array([1.0, 3.0])) == pytest.approx(
+        (2 - 12.706, 2 + 12.706), abs=1e-3
+    )  # of tables of Student's t
     assert interval(np.array([1.0, 3.0, 1.0, 3.0])) == pytest.approx((2 - 1.8374, 2 + 1.8374), abs=1e-3)
 
 

@@ -105,7 +105,8 @@ def test_a_matte_that_cannot_be_read_is_not_measured(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("level", "behind", "changes"), [(100.0, None, 1), (1.0, None, 0), (100.0, 2.0, 1), (100.0, 1.0, 0), (100.0, 0.5, 0)]
+    ("level", "behind", "changes"),
+    [(100.0, None, 1), (1.0, None, 0), (100.0, 2.0, 1), (100.0, 1.0, 0), (100.0, 0.5, 0)],
 )
 def test_light_that_changes_is_told_where_there_is_light(level: float, behind: float | None, changes: int) -> None:
     """Pictures that are black have no light that could change; a lamp on the head alone is not the camera's exposure."""
