@@ -42,7 +42,9 @@ def page_of(viewer: Viewer) -> str:
 def test_what_is_set_is_drawn(viewer: Viewer) -> None:
     until(lambda: shows(viewer, Setting()))
     setting = Setting(ViewOffset(3.0), {0: viewer.renderer.controls[0].high}, {"jaw": 0.2}, "mesh")
+    before = viewer._changed
     viewer.change(**vars(setting))
+    assert viewer._changed > before, "pictures are small for a while"
     until(lambda: shows(viewer, setting))
     viewer.player.choose("train")
     viewer.player.play()
