@@ -78,7 +78,7 @@ def _seen(
     nearest = torch.from_numpy(raster.depth)[row, column]
     eye = -camera.R_cam_world.T @ camera.t_cam_world
     facing = (torch.nn.functional.normalize(eye - points, dim=1) * normals).sum(dim=1)
-    visible = inside & (nearest > 0) & (depth < nearest + BEHIND) & (facing > 0.05)
+    visible = inside & (depth < nearest + BEHIND) & (facing > 0.05)
     return visible * facing.clamp(min=0) ** SHARPNESS
 
 

@@ -63,11 +63,8 @@ def run_jobs(folder: Path, spec: Spec, engine: Engine, progress: Progress) -> di
                 said = engine.poll(handle)
                 if said is not None:
                     del handles[name]
-                    states[name] = final_state(places[name], submitted[name], ended.pop(name, said), spec.retries)
-                    if states[name].status == "running":
-                        elsewhere.add(name)
-                    else:
-                        again += [name] if is_open(states[name], spec.retries) else []
+                    final_state(places[name], submitted[name], ended.pop(name, said), spec.retries)
+                    elsewhere.add(name)  # unless it is read below that nobody has it
                     continue
                 states[name] = read_state(places[name])
                 stored = stored_state(places[name])

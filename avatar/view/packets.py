@@ -154,7 +154,7 @@ def osc_messages(data: bytes, nesting: int = 0) -> Iterator[bytes]:
     while at < len(data):
         size = int.from_bytes(data[at : at + 4], "big")
         part = data[at + 4 : at + 4 + size]
-        if size == 0 or len(part) != size or nesting == MAX_NESTING:
+        if len(part) != size or nesting == MAX_NESTING:
             raise PacketError("a bundle of OSC is damaged")
         yield from osc_messages(part, nesting + 1)
         at += 4 + size

@@ -22,7 +22,7 @@ from data_prep.formats.tracked_folder import TrackedFolder
 from data_prep.prepare.camera_rig import find_rig
 from data_prep.prepare.check_alignment import refuse_misplaced_cameras
 from data_prep.prepare.dark_cameras import refuse_dark_cameras
-from data_prep.prepare.frame_offset import MIN_FRAMES, detect_offset
+from data_prep.prepare.frame_offset import detect_offset
 from data_prep.prepare.inspect_images import check_sizes, inspect_images
 from data_prep.prepare.mask_values import with_labels
 from data_prep.prepare.pairing import grouped
@@ -143,13 +143,11 @@ def _clocks(source: TrackedFolder, tracks: dict[int, FrameTrack], head: HeadMode
     """Each camera by itself, its pictures numbered by time: masks and mesh tell by how many they are apart."""
     for camera in sorted({source.shots[number].camera for number in tracks}):
         own = {number: source.shots[number] for number in tracks if source.shots[number].camera == camera}
-        if len(own) < MIN_FRAMES:
-            continue
         files = _with_files(source.files, {number: shot.time for number, shot in own.items()})
         try:
             found = detect_offset(head, {own[n].time: tracks[n] for n in own}, files, ignore_misfit=True)
         except UserError:
-            continue  # nothing moves enough to tell
+            continue  # too few, or nothing moves enough to tell
         if found.offset:
             late = "late" if found.offset > 0 else "early"
             yield Finding(

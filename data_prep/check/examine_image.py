@@ -109,7 +109,7 @@ def measure_matte(alpha: np.ndarray, head: np.ndarray, solid: np.ndarray) -> Mat
     weight = alpha.astype(np.float32) * head * (1 / 255**2)
     on = weight > 0.5
     apart = cv2.distanceTransform((~on).astype(np.uint8), cv2.DIST_L2, 3)
-    far = apart > FAR * weight.shape[1] if on.any() else ~on
+    far = apart > FAR * weight.shape[1]  # everywhere, where nobody is
     border = max(3, round(0.04 * weight.shape[1])) | 1
     inner = cv2.erode(solid.astype(np.uint8), np.ones((border, border), np.uint8)) > 0
     areas = np.sort(np.bincount(np.asarray(label(on)).ravel())[1:])[::-1]  # of the pieces; 0 is what lies around

@@ -16,7 +16,7 @@ from lively import lively_run
 
 from avatar.files.video import Sound, write_video
 from avatar.motion.drive import Drive
-from avatar.pipeline.backdrop import parse_backdrop
+from avatar.pipeline.backdrop import _covering, parse_backdrop
 from avatar.pipeline.reenact import drive_sound
 from avatar.runs.trained_avatar import load_avatar
 
@@ -76,6 +76,15 @@ def test_what_lies_behind(run: Path, tracked_folder: Path, tmp_path: Path) -> No
     cv2.imwrite(str(tmp_path / "narrow.png"), np.full((4000, 1, 3), (10, 200, 30), np.uint8))
     over = parse_backdrop(str(tmp_path / "narrow.png")).pixels(rendering, trained.background)  # in little memory
     assert over.shape == (*rendering.alpha.shape, 3) and abs(over[0, 0].astype(int) - [30, 200, 10]).max() < 4
+
+
+@pytest.mark.parametrize(("height", "width", "top", "left"), [(12, 10, 0, 100), (10, 30, 10, 0)])
+def test_a_backdrop_is_the_middle_of_its_picture_and_has_no_moire(height: int, width: int, top: int, left: int) -> None:
+    row, column = torch.arange(120)[:, None].expand(120, 300), torch.arange(300).expand(120, 300)
+    shown = _covering(torch.stack((row, column, 300 * (row % 10 == 0)), dim=-1) / 300, height, width)
+    rows, columns = top + 10 * torch.arange(height) + 4.5, left + 10 * torch.arange(width) + 4.5
+    expected = (rows[:, None].expand(height, width), columns.expand(height, width), torch.full((height, width), 30.0))
+    torch.testing.assert_close(shown, torch.stack(expected, dim=-1) / 300, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("suffix", "options"), [(".mov", ()), (".webm", ("-c:v", "libvpx-vp9"))])

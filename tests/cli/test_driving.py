@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 from camera_rig_folder import SEQUENCES, write_listings, write_sequence
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
 from avatar.data.subject import Subject
+from avatar.errors import UserError
+from avatar.motion.drive import Drive
+from avatar.pipeline.reenact import Choices, reenact
 from avatar.runs.trained_avatar import load_avatar
+from avatar.types import Camera, HeadParams, Rendering
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +56,8 @@ def test_a_single_frame_drives_once_its_offset_is_given(
         "note: there is a single frame: it can drive an avatar, and none can be trained on it"
         in capsys.readouterr().out
     )
+    shutil.rmtree(still / "head_model")  # then it is read with the avatar's
+    assert main([*command, "--frame-offset", "1"]) == 0
 
 
 def test_a_single_frame_makes_a_drive_file(still: Path, tmp_path: Path) -> None:
@@ -106,6 +115,34 @@ def test_the_frame_rate_of_a_driver_is_that_of_its_video_and_its_drive_file(
         assert json.loads((tmp_path / "driver.choices.json").read_text())["driver"]["fps"] == 60.0
     assert main(["prepare", str(folder), *reading, "--out", str(tmp_path / "prepared")]) == 0
     assert Subject.open(tmp_path / "prepared").recording.fps == 60.0
+
+
+def test_the_torso_turns_against_no_head_that_does_not_turn(
+    run: Path, tracked_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained = load_avatar(run, tracked_folder / "head_model")
+    necks = [torch.tensor([1.0, 0.1 * i, 0.0, 0.0, 1.0, 0.0]) for i in range(3)]
+    params = [replace(trained.recording.params(i), neck=neck) for i, neck in enumerate(necks)]
+    cameras, shown = [trained.recording.camera(i) for i in range(3)], list[torch.Tensor]()
+
+    def stream(_: object, frames: Iterable[tuple[HeadParams, Camera]]) -> Iterator[Rendering]:
+        for own, camera in frames:
+            shown.append(own.neck)
+            yield trained.render(own, camera)
+
+    monkeypatch.setattr(type(trained), "stream", stream)
+    own = trained.rest_params().neck
+    for given, whose, expected in (
+        (cameras, "driver", necks),
+        (cameras, "target", [own] * 3),
+        (None, "driver", [own] * 3),
+    ):
+        drive = Drive("a", 10.0, ("1", "2", "3"), params, given, torch.zeros(0))
+        shown.clear()
+        reenact(trained, drive, tmp_path / "a.mp4", Choices(transfer="raw", camera=whose))
+        torch.testing.assert_close(torch.stack(shown), torch.stack(expected))
+    with pytest.raises(UserError, match="--strength must be from 0 to 10"):
+        reenact(trained, drive, tmp_path / "a.mp4", Choices(strength=11.0))
 
 
 def test_eval_verifies_what_it_has_written(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

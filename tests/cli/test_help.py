@@ -72,7 +72,7 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     said = avatar("train", tracked_folder, "--dry-run", "trainer.iterations=20", "model.uv_size=16")
-    for fact in ("frames to train on", "about", "20 steps", "Memory", "Disk", "model.uv_size=16"):
+    for fact in ("frames to train on", "minutes: 20 steps", "Memory", "Disk", "model.uv_size=16"):
         assert fact in said
     assert list(tmp_path.iterdir()) == []
     refused = avatar("train", tracked_folder, "--dry-run", "--refine", 1, "model=gaussianheadavatar", status=1)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
+from avatar.config import load_config
 from avatar.data.source import Source
 from avatar.errors import UserError
 from avatar.pipeline import refine_plan
+from avatar.pipeline.refine_run import refine_run
 
 
 def test_what_rounds_are_trained_for() -> None:
@@ -37,6 +41,16 @@ def test_plan_survives_a_round_trip(tmp_path: Path) -> None:
     made = refine_plan.Plan(1, Source(tmp_path, tmp_path / "head_model"), ("data.size=64",), None, 1000, 77)
     made.save(tmp_path)
     assert refine_plan.Plan.load(tmp_path) == made
+    content = json.loads(refine_plan.plan_file(tmp_path).read_text())
+    refine_plan.plan_file(tmp_path).write_text(json.dumps(content | {"format": 1}))
+    with pytest.raises(UserError, match="another version of this program"):
+        refine_plan.Plan.load(tmp_path)
+
+
+def test_tracking_is_not_refined_through_features(tmp_path: Path) -> None:
+    run: Any = SimpleNamespace(config=load_config(["model=gaussianheadavatar"]))
+    with pytest.raises(UserError, match="the refinement of a tracking needs Gaussians that have colours"):
+        refine_run(run, tmp_path / "refined")
 
 
 def test_no_steps_of_the_cpu_are_measured_for_a_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ from avatar.files.lock import locked
 from avatar.gaussians.base_model import Avatar
 from avatar.losses.lpips import save_lpips
 from avatar.losses.lpips_network import Lpips
-from avatar.pipeline.open_inputs import moved_source
+from avatar.pipeline.open_inputs import at_new_place, moved_source
 from avatar.runs.checkpoint import Checkpoint, list_checkpoints, newest_checkpoint, save_checkpoint
 from avatar.runs.run import read_run_info
 from avatar.train import trainer
@@ -151,6 +151,8 @@ def test_a_run_that_has_moved_finds_the_folder_of_its_last_round(begun: Path) ->
     assert moved_source(begun, away, None, None) == Source(begun / "rounds" / "2" / "someone", head)
     with pytest.raises(UserError, match="is gone"):
         moved_source(begun, replace(info, source=Source(Path("/before"), head)), None, None)
+    inside = Source(old := Path("/before"), old / "head", tracking=old / "tracking")
+    assert at_new_place(inside, begun) == Source(begun, inside.head, tracking=begun / "tracking")
 
 
 def test_what_a_resumed_run_began_with_may_be_said_again(begun: Path, own_folder: Path) -> None:

@@ -11,9 +11,10 @@ import pytest
 import torch
 from lively import lively_avatar
 
-from avatar.export.bake_texture import bake_texture
+from avatar.export.bake_texture import _normals, _seen, bake_texture
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import uv_texels
+from avatar.motion.orbit import orbited
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat.sh import C0
 
@@ -69,3 +70,19 @@ def test_a_texture_has_the_colours_of_the_side_from_which_it_is_seen(trained: Tr
     found = np.median(baked(one)[texels.row.numpy()[in_front], texels.column.numpy()[in_front]], axis=0)
     assert abs(float(seen[0]) - 255 * 0.7) > 40
     assert np.abs(found - seen.numpy()).max() < 12
+
+
+def test_what_nobody_sees_has_the_gaussians_own_colour(trained: TrainedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
+    texels, vertices = uv_texels(trained.assets, SIZE), trained.avatar.vertices(trained.rest_params())
+    points = Embedding(trained.assets, texels).points(vertices)
+    normals = _normals(vertices, trained.assets.faces)[texels.face]
+    near = orbited(trained.rest_camera(96), zoom=4)
+    x, y = near.project(points).T[:2]
+    is_outside = (x < 0) | (x > 96) | (y < 0) | (y > 96)
+    seen = _seen(trained, vertices, points, normals, near)
+    assert (x < 0).any() and (x > 97).any() and (y < 0).any() and (y > 97).any()
+    assert (seen[~is_outside] > 0).any() and not seen[is_outside].any()
+    for name in ("YAWS", "PITCHES"):
+        monkeypatch.setattr(f"avatar.export.bake_texture.{name}", (0.0,))
+    monkeypatch.setattr("avatar.export.bake_texture._seen", lambda *_: torch.zeros(1))
+    assert np.abs(baked(trained) - 255 * COLOUR.numpy()).max() <= 2

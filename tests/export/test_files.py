@@ -210,6 +210,7 @@ def accessor(tree: dict, buffer: bytes, index: int) -> np.ndarray:
     view = tree["bufferViews"][found["bufferView"]]
     values = np.frombuffer(buffer, "<f4", 3 * found["count"], view.get("byteOffset", 0)).reshape(-1, 3)
     np.testing.assert_allclose(values.min(axis=0), found["min"], atol=1e-6)
+    np.testing.assert_allclose(values.max(axis=0), found["max"], atol=1e-6)
     return values
 
 

@@ -14,7 +14,7 @@ from pages import shown, until
 
 from avatar.data.split import Split
 from avatar.export import default_view
-from avatar.export.default_view import front_camera, neck_fade, neck_heights
+from avatar.export.default_view import FILLED, HAIR, front_camera, neck_fade, neck_heights, with_faded_neck
 from avatar.export.glb import NOTABLE
 from avatar.export.web_page import write_page
 from avatar.runs.trained_avatar import TrainedAvatar
@@ -43,7 +43,7 @@ def test_a_page_and_a_mesh_have_the_same_idea_of_what_training_has_hardly_shown(
     assert found is not None and float(found[1]) == NOTABLE
 
 
-def test_the_head_is_upright_in_the_middle(trained: TrainedAvatar) -> None:
+def test_the_head_is_upright_in_the_middle(trained: TrainedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = front_camera(trained, 128)
     assert camera.R_cam_world[0, 1].abs() < 1e-6, "no roll"
     points = camera.project(trained.avatar.head.neutral_vertices())
@@ -52,6 +52,12 @@ def test_the_head_is_upright_in_the_middle(trained: TrainedAvatar) -> None:
     middle_of_neck = camera.project(torch.tensor([[0.0, (end + chin) / 2, 0.0]]))[0, 1]
     assert float(x.mean()) == pytest.approx(64, abs=3)
     assert float(y.min() + middle_of_neck) / 2 == pytest.approx(64, abs=3)
+    aimed = default_view._from_the_front(trained, 0.05, 64).project(torch.tensor([[0.0, 0.05, 0.0]]))
+    assert aimed[0, :2].tolist() == pytest.approx([32, 32], abs=0.01)
+    monkeypatch.setattr(default_view, "FILLED", FILLED / 3)
+    high = float(trained.avatar.head.neutral_vertices()[:, 1].max())
+    hair = front_camera(trained, 128).project(torch.tensor([[0.0, high + HAIR * (high - chin), 0.0]]))
+    assert float(hair[0, 1]) == pytest.approx(64 - 64 * FILLED / 3, abs=0.5)
 
 
 def test_the_neck_fades_from_the_chin_to_its_end(trained: TrainedAvatar, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,6 +70,8 @@ def test_the_neck_fades_from_the_chin_to_its_end(trained: TrainedAvatar, monkeyp
     fade = neck_fade(trained)
     assert (fade[heights <= end] == 0).all() and (fade[heights >= chin] > 0.999).all()
     assert (fade[heights.argsort()].diff() >= 0).all()
+    was, kept = trained.avatar.opacity_logits.sigmoid(), with_faded_neck(trained).avatar.opacity_logits.sigmoid()
+    torch.testing.assert_close(kept, was * fade, atol=2e-6, rtol=1e-4)
     half = fade[(heights - (end + chin) / 2).abs().argmin()]
     assert 1 - (1 - float(half)) ** 8 == pytest.approx(0.5, abs=0.1), (
         "eight layers stop half of the light in the middle"

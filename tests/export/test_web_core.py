@@ -93,6 +93,8 @@ def test_webassembly_draws_the_same_pictures(
 ) -> None:
     folder = open_mouth_folder if model == "teeth" else tracked_folder
     trained = lively_avatar(folder, tmp_path / "run", *MODELS[model])
+    with torch.no_grad():
+        trained.avatar.opacity_logits[::9] = -9.0  # too faint to be seen: these are left out
     truth = drawn_here(trained)
     assert 0.1 < float((truth != trained.background).float().mean()) < 0.95, "something to see, and something around it"
     assert psnr(truth[0], truth[1]) < 30, "frames differ"

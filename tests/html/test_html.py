@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from avatar.html import data_table, document, element, join, picture, tiles
+from avatar.html import data_table, document, element, figure_of, join, picture, plot, section, tiles
 from avatar.html.parts import data_uri
 
 NASTY = "<script>alert(\"x\")</script> & 'y'"
@@ -23,6 +23,9 @@ def test_text_and_attributes_are_escaped_once() -> None:
     assert SAFE in tiles({"name": NASTY}) and SAFE in data_table([NASTY], []) and SAFE in data_table([], [[NASTY]])
     page = document(NASTY, [NASTY])
     assert "<script>" not in page and page.count(SAFE) == 2
+    assert f"<title>{SAFE}</title>" in page and f"<main>{SAFE}</main>" in page
+    assert f"<figcaption>{SAFE}</figcaption>" in plot(figure_of()[0], NASTY)
+    assert element("p", None, 0.0) == "<p>0.0</p>" and section("a", "b") == "<section><h2>a</h2>b</section>"
 
 
 def test_attribute_names_and_values() -> None:
@@ -38,6 +41,7 @@ def test_columns_without_anything_are_left_out() -> None:
     table = data_table(["x", "y", "z"], [["a", "-", 0.0], ["-", None, None]])
     assert "<th>x</th><th>z</th>" in table and '<td>a</td><td class="number">0.0</td>' in table
     assert "<th>y</th>" in data_table(["x", "y"], []), "without rows nothing is known"
+    assert 'tabindex="0"' in table, "the arrow keys scroll it"
 
 
 def test_an_image_comes_back_from_its_url() -> None:
@@ -51,9 +55,11 @@ def test_an_image_comes_back_from_its_url() -> None:
 
 def test_the_policy_forbids_all_but_the_pages_own_script() -> None:
     assert "default-src &#x27;none&#x27;" in document("t", [])
+    assert '<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="default-src' in document("t", [])
+    assert '<meta name="viewport" content="width=device-width' in document("t", [])
     assert "script-src" not in document("t", [])
     assert "script-src &#x27;sha256-" in document("t", [], "let a = 1 < 2;")
-    assert "let a = 1 < 2;" in document("t", [], "let a = 1 < 2;")
+    assert "</main><script>let a = 1 < 2;</script>" in document("t", [], "let a = 1 < 2;"), "what it looks for is there"
     with pytest.raises(ValueError, match="must not contain"):
         document("t", [], "'</SCRIPT>'")
 

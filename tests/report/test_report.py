@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from access import audited
 from browsers import chromium
 from small_runs import train_small
@@ -21,10 +22,12 @@ from tracked_folder import write_tracked_folder
 from avatar.cli import main
 from avatar.errors import UserError
 from avatar.pipeline.open_inputs import open_run
-from avatar.report.page import _figures, bins_tables, means_table, render_report
+from avatar.report.page import _curves, _figures, _origin, bins_tables, means_table, render_report
+from avatar.report.pictures import frame_panels
 from avatar.runs.training_curves import read_curves
 from avatar.sweep.results import fold_results
 from avatar.sweep.spec import Job, Resources, Spec
+from avatar.tensors import to_8_bit
 
 LOADED = "[[...document.images].filter((one) => one.naturalWidth > 0).length, document.images.length]"
 
@@ -50,9 +53,11 @@ def test_the_page_holds_figures_frames_curves_and_origin_and_loads_nothing(run: 
     sources = re.findall(r'src="([^"]{0,30})', page)
     assert len(sources) == 6 + 2 + 2  # held-out frames; curves and worst of the evaluation; training
     assert all(source.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for source in sources)
-    assert f"<h1>Run {run.parent.name}</h1>" in page and "<dd>someone</dd>" in page
+    assert means_table(results["protocols"]) in page and page.count("<details><summary>The ") == 2
+    assert f"<header><h1>Run {run.parent.name}</h1>" in page and "<dd>someone</dd>" in page
     assert str(run.parent.parent) not in page, "where this machine keeps its files concerns nobody else"
     assert results["data_hash"] in page and "trainer.learning_rates.scale" in page
+    assert 'id="frame" min="0" max="5" value="0"' in page
     assert len(page) < 8e6
 
 
@@ -63,10 +68,25 @@ def test_the_avatars_page_beside_a_run_is_linked(run: Path, tmp_path: Path) -> N
     assert link not in render_report(open_run(alone))
 
 
-def test_curves_are_those_that_training_recorded(run: Path, tmp_path: Path) -> None:
+def test_the_truth_is_on_the_left(run: Path) -> None:
+    opened = open_run(run)
+    name, image = frame_panels(opened)[0]
+    frame = opened.subject.frame(opened.subject.split.test[0], opened.config.data.size)
+    truth = to_8_bit(frame.composite(torch.tensor(opened.config.data.background))).numpy()
+    assert name == frame.name and np.array_equal(image[-len(truth) :, : truth.shape[1]], truth)
+    assert image[-len(truth) :, truth.shape[1] : 2 * truth.shape[1]].std() > 5, "and a picture beside it"
+
+
+def test_curves_are_those_that_training_recorded(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps, psnr, total, *terms = read_curves(run).T
     assert steps.tolist() == [2, 4, 6, 8, 10, 12] and (total > 0).all() and (psnr > 0).all()
     np.testing.assert_allclose(sum(terms), total, rtol=1e-5)
+    figures = list[Any]()
+    monkeypatch.setattr("avatar.report.page.plot", lambda figure, *_: figures.append(figure))
+    _curves(run)
+    drawn = [(axes.get_yscale(), *axes.lines[0].get_data()) for axes in (figure.axes[0] for figure in figures)]
+    for (scale, x, y), (expected, values) in zip(drawn, (("log", total), ("linear", psnr)), strict=True):
+        assert scale == expected and x.tolist() == steps.tolist() and y.tolist() == values.tolist()
     assert len(read_curves(run / "nowhere")) == 0
     for damaged in (b"", b"step,psnr,total\n1,2,3\n", b"step\n1,2,3,4,5,x\n", b"\xff"):
         (tmp_path / "curves.csv").write_bytes(damaged)
@@ -83,6 +103,9 @@ def test_protocols_without_a_figure_have_a_dash() -> None:
 def test_a_round_of_refinement_is_named_without_the_machines_folders(run: Path) -> None:
     opened = open_run(run)
     results = json.loads((run / "eval" / "results.json").read_text())
+    assert "Measured at step" not in "".join(_figures(opened, results))
+    assert "Measured at step 7, while the newest" in "".join(_figures(opened, results | {"step": 7}))
+    assert "<p>a note</p>" in "".join(_origin(opened, results | {"notes": ["a note"]}))
     one = {"run": "/home/me/films/me/run/rounds/1/run", "step": 9}
     one |= {"frames_trained_on": 3, "measured_frames_trained_on": 0}
     results["tracking"] |= {"refined": "through the avatar of another run", "rounds": [one]}

@@ -99,6 +99,15 @@ def test_jobs_without_a_gpu_see_none_and_run_by_cores(
     assert [gpus for _, gpus in started.values()] == ["", ""]
 
 
+@pytest.mark.parametrize(("threads", "memory_gb", "jobs"), [(1, 0.1, 8), (3, 0.1, 2), (1, 2.5, 4), (9, 11.0, 1)])
+def test_cores_and_memory_bound_the_jobs_at_a_time(
+    monkeypatch: pytest.MonkeyPatch, threads: int, memory_gb: float, jobs: int
+) -> None:
+    monkeypatch.setattr(engines.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(engines, "available_bytes", lambda: 10 * 2**30)
+    assert engines.workers_that_fit(Resources(threads, memory_gb)) == jobs
+
+
 def test_a_cluster_gives_gpus_to_those_that_ask_by_name() -> None:
     assert spec_of("", "cpu").gpus_of_a_job(False) == 0
     assert spec_of("", "cuda").gpus_of_a_job(False) == 1
@@ -117,6 +126,7 @@ def test_ray_is_asked_for_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     make_engine("ray", spec_of("cuda"), Path(), EngineOptions())
     make_engine("ray", spec_of(""), Path(), EngineOptions())
     assert [needs.get("num_gpus") for needs in asked] == [1, None]
+    assert [needs["max_retries"] for needs in asked] == [0, 0]  # the sweep decides what is tried again
 
 
 def test_rays_own_cluster_has_the_processors_of_its_jobs(monkeypatch: pytest.MonkeyPatch) -> None:

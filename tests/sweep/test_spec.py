@@ -18,7 +18,7 @@ def test_a_sweep_is_every_subject_with_every_variant_and_seed(tmp_path: Path) ->
         write(
             tmp_path / "sweep.yaml",
             """
-            subjects: [anna, {folder: /data/carla, head: models/flame, frame_offset: 1}]
+            subjects: [anna, {folder: /data/carla, head: models/flame, frame_offset: 1, tracking: null}]
             head: head_model
             variants: {n8: [], n32: [model.latent_dim=32]}
             overrides: [data.size=64]
@@ -90,6 +90,9 @@ MISTAKES = {
         "subjects: [a]\nvariants: [[]]\nproduct: {experiment: [demo]}",
         "variants or product, not both",
     ),
+    "variants that are a number": ("subjects: [a]\nvariants: 3", "variants must name at least one list of overrides"),
+    "no variants": ("subjects: [a]\nvariants: {}", "variants must name at least one list of overrides"),
+    "a product that is a list": ("subjects: [a]\nproduct: [4]", "product must hold a list of values for each key"),
     "an empty product": ("subjects: [a]\nproduct: {experiment: []}", "product must hold a list of values for each key"),
     "too many": (
         f"subjects: [a]\nseeds: {list(range(318))}\nproduct: {{trainer.dssim_weight: {list(range(1, 316))}}}",  # 100,170

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import csv
 import importlib.util
+import io
 import json
 import os
+import re
 import shutil
 import signal
 import threading
@@ -22,6 +24,7 @@ from avatar.errors import UserError
 from avatar.runs.checkpoint import list_checkpoints
 from avatar.sweep.spec import Job, Resources, Spec
 from avatar.sweep.state import State, read_state, read_sweep, write_state, write_sweep
+from avatar.sweep.status import Progress, overview
 
 ENGINES = {"local": "json", "ray": "ray", "slurm": "submitit"}
 OPTIONS = {"local": (), "ray": (), "slurm": ("--address", "local")}
@@ -151,6 +154,28 @@ def test_a_sweep_that_is_refused_writes_no_job(tmp_path: Path) -> None:
         shutil.rmtree(tmp_path / "jobs" / name)
     assert write_sweep(tmp_path, spec("a:3", "b:1")) == ["c"], "whose folder a person deleted, as that of a"
     assert read_sweep(tmp_path) == spec("a:3", "b:1")
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_says_when_all_will_be_over_and_rewrites_only_its_own_lines() -> None:
+    states = {"a": State("done", 1, seconds=100), "b": State("done", 1, seconds=200), "c": State("running", 1)}
+    states |= {"d": State(), "e": State("failed", 3, sentence="a sentence")}
+    lines = overview(states)
+    assert lines[0] == "5 jobs: 2 done, 1 running, 1 waiting, 1 failed"
+    assert "takes 2 min 30 s" in lines[1] and "about 5 min 00 s with 1 at a time" in lines[1]
+    assert "about 1 min 15 s with 4 at a time" in overview(states, 4)[1]
+    assert [line.split()[:2] for line in lines[2:]] == [["running", "c"], ["failed", "e:"]]
+    assert len(overview({})) == 1
+    progress = Progress(out=(out := Terminal()))
+    progress.show(states)
+    assert re.findall(r"\x1b\[\d+A", out.getvalue()) == []
+    progress.show(states)  # too soon to be drawn again
+    progress.show(states, last=True)
+    assert re.findall(r"\x1b\[\d+A", out.getvalue()) == ["\x1b[4A"]
 
 
 def test_a_worker_that_fell_silent_is_replaced(tmp_path: Path) -> None:

@@ -6,11 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from avatar.errors import UserError
 from avatar.evaluation.compare_tables import FORMATS
-from avatar.sweep.results import fold_results
+from avatar.sweep.results import fold_results, interval
 from avatar.sweep.spec import Job, Resources, Spec
 
 PLAIN, REFINED = "plain", "refined"
@@ -67,6 +68,14 @@ def test_a_variant_with_a_job_that_saw_measured_frames_is_marked_and_mixed_terms
         shown = FORMATS[name][1](comparison)
         assert "b (!)" in shown and "a (!)" not in shown and "(!): " in shown
         assert "a dssim and lpips-vgg, b dssim" in shown
+
+
+def test_intervals_know_how_few_trainings_there_are() -> None:
+    assert interval(np.array([1.0])) is None
+    assert interval(np.array([1.0, 3.0])) == pytest.approx(
+        (2 - 12.706, 2 + 12.706), abs=1e-3
+    )  # of tables of Student's t
+    assert interval(np.array([1.0, 3.0, 1.0, 3.0])) == pytest.approx((2 - 1.8374, 2 + 1.8374), abs=1e-3)
 
 
 def test_each_kind_of_refinement_is_explained(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -153,6 +154,20 @@ def test_the_head_moves_as_the_drivers(trained: TrainedAvatar, rest: Seen) -> No
     assert camera.fx == own.fx and camera.t_cam_world[1:].equal(own.t_cam_world[1:])
     share = (camera.t_cam_world[0] - own.t_cam_world[0]) / own.t_cam_world[2]
     assert float(share) == pytest.approx(0.06 / 0.6), "as far across the picture, whatever the distance"
+
+
+@pytest.mark.parametrize("joint", ["jaw", "turn", "lean"])
+def test_a_torso_that_training_moved_stays_while_the_head_turns(
+    joint: str, trained: TrainedAvatar, script: Script, rest: Seen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("avatar.view.webcam.joint_ranges", lambda _: {joint: (-1.0, 1.0)})
+    webcam: Any = Webcam(trained, script, lambda _: None)  # type: ignore[arg-type]
+    webcam._learn(script.calibration)
+    turn = axis_angle_to_rotation_matrix(torch.tensor([[0.0, 0.4, 0.0]]))[0]
+    webcam._take(replace(rest, R_cam_head=turn @ rest.R_cam_head))
+    own, neck = trained.rest_camera().R_cam_world, matrix_from_6d(trained.rest_params().neck)
+    expected = neck if joint == "jaw" else neck @ own.T @ turn @ own
+    torch.testing.assert_close(matrix_from_6d(shown(webcam).params.neck), expected, atol=1e-5, rtol=0)
 
 
 def test_without_a_face_the_last_one_stays(webcam: Webcam, script: Script, rest: Seen) -> None:

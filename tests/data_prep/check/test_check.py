@@ -243,8 +243,8 @@ def test_what_prepare_refuses_is_an_error_and_nothing_stops_the_check(case: str,
     """Every folder that `prepare` refuses, for one reason each, is checked to the end with status 2."""
     CASES[case][0](folder)
     check = checked(folder, offset=None)
-    assert check.status == 2, check.findings
-    assert {finding.severity for finding in check.findings} >= {"error"}
+    errors = {finding.check for finding in check.findings if finding.severity == "error"}
+    assert check.status == 2 and errors and ("left-out" not in errors or len(errors) == 1)  # small losses apart
 
 
 def test_a_number_that_training_refuses_is_an_error(good_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -293,7 +293,7 @@ def test_json_is_all_of_stdout_and_the_status_is_that_of_the_findings(
     all_zero(5)(folder)
     assert main(["check", str(folder), "--frame-offset", "1", "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
-    assert report["exit_status"] == 1 and report["facts"]["frame offset"] == 1
+    assert report["exit_status"] == 1 and report["facts"]["frame offset"] == 1 and "field of view" in report["facts"]
     assert {"severity": "warning", "check": "no-face"}.items() <= report["findings"][0].items()
     assert main(["check", str(folder / "nowhere"), "--json"]) == 2
     (only,) = json.loads(capsys.readouterr().out)["findings"]

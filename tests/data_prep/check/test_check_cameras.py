@@ -208,6 +208,12 @@ def test_what_one_camera_loses_is_a_share_of_all_pictures(rig: Path, tmp_path: P
     assert [finding.severity for finding in check.findings if finding.check == "unreadable"] == ["warning"]
     assert check.status == 1
     assert opened(folder, tmp_path / "out")
+    for path in sorted((folder / "images").glob("*_07.png"))[7:9]:
+        path.write_bytes(b"x")
+    together = {f.severity for f in checked(folder).findings if "camera 07" in f.problem}
+    assert together == {"error"}  # four of sixty
+    for path in sorted((folder / "images").glob("*_07.png"))[7:9]:
+        shutil.copy(rig / "images" / path.name, path)
     assert checked(folder, cameras="front").status == 2
     with pytest.raises(UserError):
         opened(folder, tmp_path / "front", cameras="front")

@@ -14,6 +14,8 @@ from heads import grid_head
 
 from avatar.head.assets import HeadAssets, load_head_assets
 from data_prep.check.check_head import check_head
+from data_prep.check.findings import Finding
+from data_prep.check.folder import check_tracked_folder
 
 
 def two_balls(turned: bool = False) -> HeadAssets:
@@ -90,6 +92,13 @@ def test_only_the_piece_that_is_inside_out_is_named() -> None:
 @pytest.mark.parametrize("make", [grid_head, two_balls])
 def test_good_meshes_have_no_findings(make: Callable[[], HeadAssets]) -> None:
     assert check_head(make()) == []
+
+
+def test_a_folder_is_checked_with_its_head(tracked_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flaw = Finding("note", "head-mesh", "a flaw", "nothing")
+    monkeypatch.setattr("data_prep.check.folder.check_head", lambda _: [flaw])
+    head = tracked_folder / "head_model"
+    assert flaw in check_tracked_folder(tracked_folder, lambda: load_head_assets(head), frame_offset=1).findings
 
 
 @pytest.mark.shared

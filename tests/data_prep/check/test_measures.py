@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,13 +10,20 @@ import numpy as np
 import pytest
 from some_tracks import track
 
+from avatar.data.source import Source
 from avatar.data.split import Split
+from avatar.errors import UserError
+from data_prep.check import clip as clip_module
 from data_prep.check import plots
 from data_prep.check.check_images import _exposure
 from data_prep.check.check_tracking import _camera
+from data_prep.check.clip import Clip
 from data_prep.check.coverage import Coverage, measure_coverage
+from data_prep.check.examine_image import look_at, measure_matte
 from data_prep.check.head_angles import head_angles, measure_jumps
-from data_prep.formats.frame_track import FrameTrack
+from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE
+from data_prep.formats.frame_track import FrameTrack, Tracking
+from data_prep.prepare.frame_offset import OffsetEstimate
 
 TRAIN, TEST = 20, 5
 
@@ -77,11 +85,35 @@ def test_a_frame_is_compared_with_its_neighbours_in_time() -> None:
     assert np.isnan(gap.rotation).tolist() == [True, False, True, True, False, True]
 
 
-@pytest.mark.parametrize(("level", "changes"), [(100.0, 1), (1.0, 0)])
-def test_light_that_changes_is_told_where_there_is_light(level: float, changes: int) -> None:
-    """Pictures that are black have no light that could change."""
-    colours = [np.full(3, level * (1 if n < 30 else 2)) for n in range(60)]
-    views = {n: SimpleNamespace(head_colour=colour, background_colour=None) for n, colour in enumerate(colours)}
+def test_a_matte_that_cannot_be_read_is_not_measured(tmp_path: Path) -> None:
+    (tmp_path / "any").write_bytes(b"")
+
+    def decode(kind: str, _: bytes, path: Path) -> np.ndarray:
+        if kind == ALPHA:
+            raise UserError(f"{path} is damaged")
+        return np.full((64, 64, 3) if kind == IMAGE else (64, 64), 200, np.uint8)
+
+    whole = {IMAGE: tmp_path / "any", HEAD: tmp_path / "any"}
+    matte = look_at(whole, decode).matte
+    assert matte is not None and (matte.covered, matte.haze, matte.holes, matte.specks) == (1.0, 0.0, 0.0, 0.0)
+    assert look_at(whole | {ALPHA: tmp_path / "any"}, decode).matte is None
+    thin, head = np.full((64, 64), 51, np.uint8), np.full((64, 64), 255, np.uint8)
+    thin[:16, :16] = 255
+    found = measure_matte(thin, head, thin > 127)
+    assert (found.covered, found.haze) == pytest.approx((1 / 16, 0.2))
+    assert measure_matte(thin // 4, head, thin > 255).haze == pytest.approx((15 * 12 + 63) / 16 / 255), "nobody at all"
+
+
+@pytest.mark.parametrize(
+    ("level", "behind", "changes"),
+    [(100.0, None, 1), (1.0, None, 0), (100.0, 2.0, 1), (100.0, 1.0, 0), (100.0, 0.5, 0)],
+)
+def test_light_that_changes_is_told_where_there_is_light(level: float, behind: float | None, changes: int) -> None:
+    """Pictures that are black have no light that could change; a lamp on the head alone is not the camera's exposure."""
+    views = {}
+    for n in range(60):
+        background = None if behind is None else np.full(3, 60.0 * (1 if n < 30 else behind))
+        views[n] = SimpleNamespace(head_colour=np.full(3, level * (1 + (n >= 30))), background_colour=background)
     read: Any = SimpleNamespace(views=views, name=str, names=tuple, files=SimpleNamespace(images={}, alphas={}))
     assert len(list(_exposure(read))) == changes
 
@@ -106,3 +138,18 @@ def test_what_is_shaded_is_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
     spans = [patch.get_extents().transformed(figure.axes[0].transData.inverted()) for patch in figure.axes[0].patches]
     shaded = [number for number in images if any(span.x0 < number < span.x1 for span in spans)]
     assert shaded == [images[place] for place in test]
+
+
+def test_the_ends_of_a_clip_are_compared_where_both_are_clear(monkeypatch: pytest.MonkeyPatch) -> None:
+    def parts(*found: int | str) -> tuple[int, int] | None:
+        each = iter(one if isinstance(one, str) else OffsetEstimate(one, 9.0, 0, 60, False) for one in found)
+        monkeypatch.setattr(clip_module, "_estimate", lambda *_: next(each))
+        numbers: Any = dict.fromkeys(range(3 * clip_module.MIN_PART))
+        nothing: Any = None
+        read = Clip(Source(Path(), Path()), nothing, Tracking(numbers, {}, [], {}), (), (), None, None, "", None)
+        done = clip_module._with_offset(read, nothing)
+        assert done.offset == (None if found[2] == "unclear" else found[2])
+        return done.part_offsets
+
+    assert parts(1, 2, 1) == (1, 2)
+    assert parts(1, "unclear", 1) is None and parts("unclear", 1, "unclear") is None

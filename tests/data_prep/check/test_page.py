@@ -96,6 +96,7 @@ def test_the_title_names_what_avatar_create_made(tmp_path: Path, monkeypatch: py
 def test_the_table_has_a_line_for_every_image(page: Path) -> None:
     rows = list(csv.DictReader((page.parent / "frames.csv").open()))
     assert [row["image"] for row in rows] == [f"{n:05d}.jpg" for n in range(1, 25)]
+    assert rows[0]["change"] == "" and all(0 < float(row["change"]) < 30 for row in rows[1:])
     assert rows[5]["overlap"] == "" and all(float(row["overlap"]) > 0.99 for row in rows if row["image"] != "00006.jpg")
 
 

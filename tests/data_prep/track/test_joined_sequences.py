@@ -53,6 +53,11 @@ def test_sequences_that_do_not_say_how_long_they_are_are_not_joined(raw: Path, t
     """A stream without a container: nothing would be read of it."""
     folders = sequences(raw, tmp_path)
     opened = [recording.open_recording(folder) for folder in folders]
+    slower = [
+        replace(one, cameras={s: replace(c, footage=replace(c.footage, rate=10.0)) for s, c in one.cameras.items()})
+        for one in opened
+    ]
+    assert recording.join_recordings(slower).sequences[1] == ("FREE", pytest.approx(0.3))  # two pictures and none
     camera = opened[1].cameras[SERIALS[0]]
     opened[1].cameras[SERIALS[0]] = replace(camera, footage=replace(camera.footage, duration=None))
     with pytest.raises(UserError, match=f"FREE/images/cam_{SERIALS[0]}.mp4 does not say how long it is"):

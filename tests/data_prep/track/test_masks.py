@@ -113,7 +113,7 @@ def test_the_ring_is_the_lowest_open_edge() -> None:
         return np.concatenate(rows), np.concatenate((np.stack((a, b, b + 6), 1), np.stack((a, b + 6, a + 6), 1)))
 
     (high, high_faces), (low, low_faces) = tube(5, 0), tube(0, 12)
-    points, faces = np.concatenate((high, low)), np.concatenate((high_faces, low_faces))
+    points, faces = np.concatenate((high, low + np.array([0, 0, 1]))), np.concatenate((high_faces, low_faces))
     assert sorted(neck_ring(points, faces).tolist()) == list(range(12, 18))
     tetrahedron = np.array([(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)])
     with pytest.raises(UserError, match="closed everywhere"):

@@ -126,7 +126,9 @@ def test_a_calibration_of_other_cameras_is_refused() -> None:
     views = filmed(truth, 1.0)
     refuse_misfit(place_head(tracked(truth), views), views, Path("SPEECH"))
     views |= {name: views[name]._replace(R=turned @ views[name].R) for name in ("left", "far")}
+    placed = place_head(tracked(truth), views)
+    views["right"] = views["right"]._replace(found=50 * views["right"].found)  # one that sees the face much larger
     with pytest.raises(
         UserError, match="the calibration of SPEECH does not fit .* off by [0-9.]+ pixels in the median"
     ):
-        refuse_misfit(place_head(tracked(truth), views), views, Path("SPEECH"))
+        refuse_misfit(placed, views, Path("SPEECH"))

@@ -248,7 +248,9 @@ def test_mattes_of_a_part_are_of_its_own_pictures(kind: str, tmp_path: Path) -> 
         assert [int(p.image[0, -1]) // 4 for p in open_mattes(folder, video, span).read(view, span)] == pictures
         if kind == "later than the sound":
             mattes = open_mattes(as_a_video, video, span)
-            assert [int(p.image[0, -1]) // 4 for p in mattes.read(view, span)] == pictures
+            read = [*mattes.read(view, span)]
+            assert [int(p.image[0, -1]) // 4 for p in read] == pictures
+            assert [p.time for p in read] == pytest.approx([n / 25 + 0.08 for n in pictures], abs=2e-3)
             assert "begin at 0.00 s of their file and the video's pictures at 0.08 s" in " ".join(mattes.notes)
 
 

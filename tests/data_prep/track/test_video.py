@@ -10,7 +10,7 @@ from videos import LOSSLESS, X264, centre_of, encode, ffmpeg, spot
 
 from avatar.errors import UserError
 from data_prep.track.footage.picture_folder import open_footage
-from data_prep.track.footage.source import Box, Span, View, whole
+from data_prep.track.footage.source import MAX_SIDE, MIN_SIDE, Box, Span, View, check_size, whole
 from data_prep.track.footage.tone_mapping import has_zimg
 from data_prep.track.footage.video import open_video
 
@@ -272,6 +272,9 @@ def test_impossible_sizes(tmp_path: Path) -> None:
     encode(tmp_path / "a.mp4", [np.zeros((32, 48, 3), np.uint8)] * 3)
     with pytest.raises(UserError, match="a.mp4 has pictures of 48x32 pixels; a face needs 64 at least"):
         open_video(tmp_path / "a.mp4")
+    check_size(tmp_path, MAX_SIDE, MIN_SIDE)
+    with pytest.raises(UserError, match=f"pictures of 64x{MAX_SIDE + 1} pixels; more than {MAX_SIDE} a side"):
+        check_size(tmp_path, 64, MAX_SIDE + 1)
     ffmpeg("-f", "lavfi", "-i", "color=s=8200x8200:d=0.04", "-frames:v", "1", "-c:v", "png", tmp_path / "b.mov")
     with pytest.raises(UserError, match="none of the pictures in .*b.mov can be decoded"):
         open_video(tmp_path / "b.mov")
