@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from argparse import Namespace
 from collections.abc import Iterator
@@ -10,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
 from avatar.compute.availability import has_gpu_driver
+from avatar.compute.processors import processor_count
 from avatar.config_values import config_dir
 from avatar.errors import UserError, install
 from avatar.files.environment import named_path
@@ -42,7 +42,7 @@ class Finding(NamedTuple):
 def run_doctor(_: Namespace) -> int:
     """Print the table of findings. Returns 1 when something that every command needs does not work, else 0."""
     found = [*essentials(), gpu(), head_model(), models(), *map(package, EXTRAS)]
-    system = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
+    system = f"{platform.system()} {platform.machine()}, {processor_count()} processors"
     print(f"avatar {__version__}, Python {platform.python_version()}, {system}\n")
     for line in table(found):
         print(line)

@@ -9,6 +9,7 @@ from contextlib import suppress
 
 from avatar.commands import find_command
 from avatar.commands.arguments import parse, refuse_missing
+from avatar.compute.processors import limit_threads
 from avatar.errors import UserError
 
 EXIT_ERROR = 1
@@ -24,6 +25,7 @@ def main(argv: Sequence[str] | None = None, *, when_loaded: Callable[[], object]
     try:
         arguments = parse(argv)
         refuse_missing(arguments)
+        limit_threads()
         command = find_command(arguments.command)
         when_loaded()
         return command(arguments)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections import OrderedDict, deque
 from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
+from avatar.compute.processors import processor_count
 from avatar.data.frame import Frame
 from avatar.data.gpu_frame_cache import GpuFrameCache
 from avatar.data.subject import FramePixels, Subject
@@ -31,7 +31,7 @@ class FrameLoader:
         self.cached_bytes = 0
         self._frame_cache = frame_cache
         self._cache: OrderedDict[int, FramePixels] = OrderedDict()  # only touched by the thread that iterates
-        workers = 1 if frame_cache is None else min(os.cpu_count() or 1, GPU_WORKERS)
+        workers = 1 if frame_cache is None else min(processor_count(), GPU_WORKERS)
         self._ahead = FRAMES_AHEAD * workers
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="frames")
         self._closed = False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,6 +13,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from avatar.compute.processors import processor_count
 from avatar.compute.workers import in_order
 from avatar.demo.head import NUM_EXPRESSION, NUM_IDENTITY, demo_head
 from avatar.demo.head_files import write_head_model
@@ -142,7 +142,7 @@ def rendered(
         params, camera = frame_params(performance, frame), frame_camera(performance, frame, size)
         return params, camera, renderer.render(params, camera)
 
-    return in_order(one, range(len(performance.jaw)), os.cpu_count() or 1)
+    return in_order(one, range(len(performance.jaw)), processor_count())
 
 
 def _write_frame(

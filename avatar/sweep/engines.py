@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from avatar.compute.device import visible_gpus
 from avatar.compute.memory import available_bytes
+from avatar.compute.processors import processor_count
 from avatar.errors import UserError, check_installed
 from avatar.sweep.spec import Resources, Spec
 from avatar.sweep.worker import Worker, work_until_done
@@ -65,7 +66,7 @@ def make_engine(name: str, spec: Spec, folder: Path, options: EngineOptions) -> 
 
 def workers_that_fit(resources: Resources) -> int:
     """How many jobs this machine's cores and memory hold at a time; at least one."""
-    by_cores = (os.cpu_count() or 1) // resources.threads
+    by_cores = processor_count() // resources.threads
     by_memory = int(available_bytes() // (resources.memory_gb * 2**30))
     return max(1, min(by_cores, by_memory))
 

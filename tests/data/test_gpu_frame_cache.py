@@ -66,7 +66,7 @@ def test_what_fits_is_decoded_once_and_kept_in_one_place(subject: Subject, monke
 
 
 def test_several_threads_decode_in_order(subject: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loader_module.os, "cpu_count", lambda: 4)
+    monkeypatch.setattr(loader_module, "processor_count", lambda: 4)
     order = [5, 1, 1, 0, 4, 2, 5, 3, 0]
     with FrameLoader(subject, 24, frame_cache=GpuFrameCache(subject, CPU, 3 * bytes_of(subject, 24))) as loader:
         for index, found in zip(order, loader.frames(order), strict=True):

@@ -138,7 +138,7 @@ def test_mouth_mask_lies_where_the_tracked_lips_are(folder: Path) -> None:
 def test_same_arguments_same_files_and_threads_do_not_matter(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: 3)
+    monkeypatch.setattr(subject, "processor_count", lambda: 3)
     again = make_subject(tmp_path / "again", frames=FRAMES, size=SIZE, seed=SEED_WITH_GLASSES)
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.suffix in (".jpg", ".png", ".obj", ".npy", ".pkl"):

@@ -103,7 +103,7 @@ def test_jobs_without_a_gpu_see_none_and_run_by_cores(
 def test_cores_and_memory_bound_the_jobs_at_a_time(
     monkeypatch: pytest.MonkeyPatch, threads: int, memory_gb: float, jobs: int
 ) -> None:
-    monkeypatch.setattr(engines.os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(engines, "processor_count", lambda: 8)
     monkeypatch.setattr(engines, "available_bytes", lambda: 10 * 2**30)
     assert engines.workers_that_fit(Resources(threads, memory_gb)) == jobs
 
