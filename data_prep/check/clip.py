@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from avatar.compute.processors import processor_count
 from avatar.data.source import DEFAULT_FPS, Source
 from avatar.data.split import evenly_spread
 from avatar.errors import UserError
@@ -224,7 +225,7 @@ def _read_views(files: FrameFiles, progress: Progress) -> tuple[dict[int, View],
     steps: dict[int, float] = {}
     previous: tuple[int, np.ndarray] | None = None
     numbers = list(files.images)
-    with ThreadPoolExecutor(max_workers=2) as pool:  # decoding releases the interpreter lock
+    with ThreadPoolExecutor(processor_count()) as pool:  # decoding releases the interpreter lock
         looks = pool.map(lambda n: look_at(_files_of(files, n), files.decode), numbers)
         for number, view in zip(numbers, progress(looks, len(numbers), "images"), strict=True):
             views[number] = replace(view, grey=None)
@@ -244,7 +245,7 @@ def _measure_fits(clip: Clip, head: HeadModel, progress: Progress) -> dict[int, 
     def measure(number: int) -> Fit | None:
         return fit_of_masks(project, tracks[number], *read_masks(clip.files, number))
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # as do matrix products
+    with ThreadPoolExecutor(max_workers=2) as pool:  # matrix products do, and have threads of their own
         fits = pool.map(measure, tracks)
         found = dict(zip(tracks, progress(fits, len(tracks), "mesh against masks"), strict=True))
     return {number: fit for number, fit in found.items() if fit is not None}

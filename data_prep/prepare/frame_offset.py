@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from avatar.compute.processors import processor_count
 from avatar.errors import UserError
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_files import FrameFiles
@@ -173,7 +174,7 @@ def _observed_features(
         parts += [_mouth_features(mouth > _MASK_ON)] if use_mouth and mouth is not None else []
         return np.concatenate(parts) if parts else None
 
-    with ThreadPoolExecutor(max_workers=2) as pool:
+    with ThreadPoolExecutor(processor_count()) as pool:
         found = dict(zip(numbers, pool.map(features, numbers), strict=True))
     return {number: values for number, values in found.items() if values is not None}
 

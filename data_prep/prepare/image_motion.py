@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from avatar.compute.processors import processor_count
 from avatar.data.read_image import read_image
 from avatar.head.model import HeadModel
 from data_prep.formats.frame_track import FrameTrack
@@ -78,7 +79,7 @@ def _flows(numbers: Sequence[int], images: Mapping[int, Path], size: tuple[int, 
             cv2.cvtColor(read_image(images[number]), cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA
         )
 
-    with ThreadPoolExecutor(max_workers=2) as pool:
+    with ThreadPoolExecutor(processor_count()) as pool:
         both = sorted({*numbers, *(n + 1 for n in numbers)})
         pictures = dict(zip(both, pool.map(grey, both), strict=True))
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from avatar.compute.processors import processor_count
 from avatar.data.read_image import read_bytes, read_image
 from avatar.errors import UserError
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, MOUTH, PARSING, TRACKING, FrameFiles
@@ -151,7 +152,7 @@ def _look_at(files: FrameFiles, kind: str, paths: Mapping[int, Path]) -> dict[in
         values = int(pixels.min()), int(pixels.max())
         return _Seen(hashlib.blake2b(data, digest_size=16).digest(), (width, height), *values, None)
 
-    with ThreadPoolExecutor(max_workers=2) as pool:  # decoding releases the interpreter lock
+    with ThreadPoolExecutor(processor_count()) as pool:  # decoding releases the interpreter lock
         return dict(zip(paths, pool.map(look, paths.values()), strict=True))
 
 
