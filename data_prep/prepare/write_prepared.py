@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from data_prep.prepare.checksums import CONTENTS_FILE, find_damage, write_conten
 
 HEAD_FOLDER, MOUTH_FOLDER = "head", "mouth"
 _PARTS = {MANIFEST_FILE, TRACKS_FILE, CONTENTS_FILE, HEAD_FOLDER, MOUTH_FOLDER}
+_THERE_IS_ANOTHER = errno.ENOENT, errno.EEXIST, errno.ENOTEMPTY  # or there was none to put back
 
 
 def is_current(target: Path, input_hash: str, is_chosen: bool, say: Callable[[str], object] = lambda _: None) -> bool:
@@ -83,10 +85,13 @@ def _replace(target: Path, building: Path, input_hash: str) -> None:
             with contextlib.suppress(FileNotFoundError):
                 target.rename(stale / "old")
             building.rename(target)
-            return
         except OSError:
-            with contextlib.suppress(OSError):  # put back, unless another process was quicker
+            try:
                 (stale / "old").rename(target)
-        finally:
-            if target.exists():
-                shutil.rmtree(stale, ignore_errors=True)
+            except OSError as error:
+                if error.errno not in _THERE_IS_ANOTHER:
+                    raise
+            shutil.rmtree(stale, ignore_errors=True)
+        else:
+            shutil.rmtree(stale, ignore_errors=True)
+            return

@@ -21,6 +21,7 @@ from avatar.data.subject import Subject
 from avatar.errors import UserError
 from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import cached_tracking as caching
+from data_prep.prepare import write_prepared
 from data_prep.prepare.prepare import prepare
 
 
@@ -114,6 +115,20 @@ def test_several_at_once_all_succeed(offsets: tuple[int, int], tmp_path: Path) -
     subject = Subject.open(tmp_path / "out")
     assert subject.frame(len(subject) - 1).mouth_mask.max() > 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "subject"]
+
+
+def test_nothing_is_left_over_where_several_take_one_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(write_prepared, "is_current", lambda *_, **__: False)
+
+    def write(number: int) -> None:
+        (building := tmp_path / f"building{number}").mkdir()
+        (building / "whole").touch()
+        write_prepared._replace(tmp_path / "out", building, "")
+        shutil.rmtree(building, ignore_errors=True)
+
+    with ThreadPoolExecutor(max_workers=4) as pool:
+        list(pool.map(write, range(400)))
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["out", "out/whole"]
 
 
 def test_the_data_hash_is_of_the_tracking_and_does_not_depend_on_the_place(tmp_path: Path) -> None:
