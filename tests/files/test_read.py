@@ -33,6 +33,7 @@ OPEN_BY_THEMSELVES = {
     "avatar/bench/machine.py",
     "avatar/bench/peak_memory.py",
     "avatar/compute/memory.py",
+    "avatar/compute/processors.py",
     "avatar/data/tensor_file.py",
     "avatar/evaluation/verify.py",
     "avatar/export/mediapipe_pack.py",
