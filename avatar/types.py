@@ -73,9 +73,7 @@ class HeadParams:
     jaw: Float[Tensor, " 6"]  # 6D rotation
     eyes: Float[Tensor, " 12"]  # two 6D rotations, left then right
     eyelids: Float[Tensor, " 2"]  # blendshape weights, left then right
-    neck: Float[
-        Tensor, " 6"
-    ]  # 6D rotation of the head against the torso: it moves the torso; not a condition of the MLP
+    neck: Float[Tensor, " 6"]  # 6D rotation of the head against the torso, which it moves; not a condition of the MLP
 
     def condition(self) -> Float[Tensor, " C"]:
         """The deformation network's per-frame input: expression, jaw, eyes, eyelids (120 values with 100 expressions)."""

@@ -19,7 +19,7 @@ class Frame:
     name: str  # stem of the image file, for example "00001"
     camera: Camera
     params: HeadParams
-    image: Float[Tensor, "H W 3"]  # as in the video file, not composited
+    image: Float[Tensor, "H W 3"]  # as in the video file, not composited; of a smaller size see `FramePixels.resized`
     alpha: Float[Tensor, "H W"]  # foreground matte; ones where the subject has none
     head_mask: Float[Tensor, "H W"]  # head and neck; ones where the subject has none
     mouth_mask: Float[Tensor, "H W"]  # lips and inner mouth

@@ -44,6 +44,25 @@ class FramePixels(NamedTuple):
     def nbytes(self) -> int:
         return sum(pixels.nbytes for pixels in self)
 
+    def resized(self, size: tuple[int, int]) -> FramePixels:
+        """Averaged to `size`, (width, height), so that `Frame.composite` of the result is the average of the composite.
+
+        With w = alpha * head mask of the large pixels and E the mean over a small one: its weight is E[w], its colour
+        E[w * image] / E[w]. E[alpha] * E[head mask] would weigh outlines too little, E[image] hold the background.
+        """
+
+        def averaged(pixels: np.ndarray) -> np.ndarray:
+            return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+
+        small = FramePixels(*map(averaged, self))
+        weight = self.alpha.astype(np.float32) * self.head_mask
+        mean = averaged(weight)
+        edge = (mean > 0) & (mean < 255.0**2)
+        small.image[edge] = np.rint(averaged(self.image * weight[..., None])[edge] / mean[edge, None])
+        masked = small.head_mask > 0
+        small.alpha[masked] = np.rint(np.minimum(mean[masked] / small.head_mask[masked], 255.0))
+        return small
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -143,9 +162,7 @@ class Subject:
         root = self.folder if self.manifest.mouth_masks == "derived" else source
         mouth_mask = self._mask(root, record.mouth_mask, shape, "mouth", default=0)
         pixels = FramePixels(image, alpha, head_mask, mouth_mask)
-        if size is None or size == width:
-            return pixels
-        return FramePixels(*(cv2.resize(p, self.image_size(size, index), interpolation=cv2.INTER_AREA) for p in pixels))
+        return pixels if size is None or size == width else pixels.resized(self.image_size(size, index))
 
     def assemble(self, index: int, pixels: FramePixels, size: int | None = None) -> Frame:
         """The frame of pixels that were decoded at `size`."""

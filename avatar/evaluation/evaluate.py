@@ -45,6 +45,7 @@ from avatar.files.video import SHARP, video_writer
 from avatar.losses.lpips_network import Lpips, Net
 from avatar.render import Renderer
 from avatar.runs.run import Run, versions
+from avatar.train.loss import opposite_background
 
 RESULTS_FORMAT = 3
 Measured = dict[Drive, dict[str, list[FrameResult]]]  # by protocol, in the order of the video
@@ -263,7 +264,7 @@ def background_notes(protocols: Sequence[Protocol], run: Run) -> list[str]:
     trained, notes = run.config.data.background, []
     over = {tuple(trained)}
     if run.config.trainer.opposite_background_every and run.avatar.has_colours:
-        over.add(tuple(float(value < 0.5) for value in trained))
+        over.add(tuple(opposite_background(torch.tensor(trained)).tolist()))
     for background in dict.fromkeys(protocol.background for protocol in protocols):
         if background not in over:
             names = [protocol.name for protocol in protocols if protocol.background == background]

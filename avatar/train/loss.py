@@ -88,7 +88,7 @@ class TrainingLoss:
 
     @cached_property
     def _opposite(self) -> Float[Tensor, " 3"]:
-        return (self.background < 0.5).to(self.background)
+        return opposite_background(self.background)
 
     def term(self, step: int) -> Weighted | None:
         """The third term of step `step`."""
@@ -122,6 +122,11 @@ class TrainingLoss:
             distance = l1_loss(where_seen(other, wanted, frame), wanted)
             loss = loss._replace(total=loss.total + distance, frame=loss.frame + distance)
         return loss
+
+
+def opposite_background(background: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
+    """Each channel 0 or 1, whichever is farther away."""
+    return (background < 0.5).to(background)
 
 
 def at_size(image: Float[Tensor, "H W C"], other: Float[Tensor, "h w _"]) -> Float[Tensor, "h w C"]:

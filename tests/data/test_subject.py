@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from tracked_folder import write_tracked_folder
 
 from avatar.data.source import Source
-from avatar.data.subject import Subject
+from avatar.data.subject import FramePixels, Subject
 from avatar.errors import UserError
 from avatar.head.assets import load_head_assets
 from data_prep.prepare.prepare import prepare
@@ -178,12 +178,43 @@ def test_frames_at_their_own_size(prepared: Path) -> None:
 def test_resized_frames_average_and_keep_the_view(prepared: Path) -> None:
     subject = Subject.open(prepared)
     full, half = subject.frame(4), subject.frame(4, size=32)
-    expected = full.image.reshape(24, 2, 32, 2, 3).mean((1, 3))
-    torch.testing.assert_close(half.image, expected, atol=0.51 / 255, rtol=0)
+    white = torch.ones(3)
+    expected = full.composite(white).reshape(24, 2, 32, 2, 3).mean((1, 3))
+    torch.testing.assert_close(half.composite(white), expected, atol=1.01 / 255, rtol=0)
     assert half.mouth_mask.shape == (24, 32) and 0 <= half.mouth_mask.min() <= half.mouth_mask.max() <= 1
     point = torch.tensor([0.01, -0.02, 0.05])
     full_xy, half_xy = full.camera.project(point)[:2], half.camera.project(point)[:2]
     torch.testing.assert_close(full_xy / 2, half_xy)
+
+
+@pytest.mark.parametrize("size", [(32, 24), (50, 38), (9, 7)])
+@pytest.mark.parametrize("background", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.2, 0.5, 0.8)])
+def test_the_composite_of_resized_frames_is_the_resized_composite(
+    prepared: Path, size: tuple[int, int], background: tuple[float, float, float]
+) -> None:
+    rng = np.random.default_rng(0)
+    noise = [cv2.GaussianBlur(rng.random((48, 64), np.float32) - 0.5, (0, 0), 2) * 20 for _ in range(2)]
+    alpha, head = (np.rint(255 * np.clip(each + 0.5, 0, 1)).astype(np.uint8) for each in noise)
+    assert 0 in alpha and 255 in alpha and 0 in head and 255 in head  # the outlines of both cross
+    pixels = FramePixels(rng.integers(0, 256, (48, 64, 3), np.uint8), alpha, head, alpha)
+    subject, over = Subject.open(prepared), torch.tensor(background)
+
+    small = pixels.resized(size)
+    assert [plane.shape[:2] for plane in small] == 4 * [size[::-1]] and {plane.dtype for plane in small} == {np.dtype(np.uint8)}
+    full = subject.assemble(0, pixels).composite(over).numpy()
+    expected = torch.from_numpy(cv2.resize(full, size, interpolation=cv2.INTER_AREA))
+    composite = subject.assemble(0, small, size[0]).composite(over)
+    torch.testing.assert_close(composite, expected, atol=1.01 / 255, rtol=0)  # image and alpha are rounded
+    np.testing.assert_array_equal(small.head_mask, cv2.resize(head, size, interpolation=cv2.INTER_AREA))
+
+
+def test_resized_frames_without_an_outline_are_averaged_as_they_are() -> None:
+    rng = np.random.default_rng(1)
+    image, alpha, mouth = (rng.integers(0, 256, shape, np.uint8) for shape in ((48, 64, 3), (48, 64), (48, 64)))
+    for matte, mask in ((np.full_like(alpha, 255), np.full_like(alpha, 255)), (alpha, np.zeros_like(alpha))):
+        pixels = FramePixels(image, matte, mask, mouth)
+        for ours, plane in zip(pixels.resized((32, 24)), pixels, strict=True):
+            np.testing.assert_array_equal(ours, cv2.resize(plane, (32, 24), interpolation=cv2.INTER_AREA))
 
 
 @pytest.mark.parametrize("index", [-1, 10])
