@@ -105,9 +105,9 @@ def reenact(
     first = first_file(out)
     heard = None if sound is None or first != out else drive_sound(*sound, drive, say)
     renderings = trained.stream(zip(moved, cameras, strict=True))
-    loader = FrameLoader(driver, data.size) if backdrop is None and isinstance(driver, Subject) else None
+    loader = FrameLoader(driver) if backdrop is None and isinstance(driver, Subject) else None
     with loader or nullcontext():
-        pictures = (frame.image for frame in loader.frames(all_moments(loader.subject))) if loader else None
+        pictures = driver_pictures(loader, data.size) if loader else None
         if backdrop is None:
             frames = panels((each.image for each in renderings), pictures, trained.name, distances.tolist())
         else:
@@ -226,18 +226,21 @@ def panels(
     name: str,
     distances: Sequence[float],
 ) -> Iterator[UInt8[np.ndarray, "H_panel W_panel 3"]]:
-    """The driver's picture, if any, beside the render, over the strip of distances; all as large as the first."""
+    """The driver's picture, if any, beside the render, over the strip of distances."""
     strip: DistanceStrip | None = None
-    size: tuple[int, int] | None = None
     for index, render in enumerate(renders):
-        images = [render]
-        if pictures is not None:
-            picture = next(pictures)
-            size = size or (picture.shape[0], picture.shape[1])
-            images = [fitted(picture, *size), render]
-        panel = side_by_side(images, [name] if pictures is None else ["driver", name])
+        images, captions = ([render], [name]) if pictures is None else ([next(pictures), render], ["driver", name])
+        panel = side_by_side(images, captions)
         strip = strip or DistanceStrip(distances, panel.shape[1], panel.shape[0])
         yield np.concatenate((panel, strip.frame(index)))
+
+
+def driver_pictures(loader: FrameLoader, size: int | None) -> Iterator[Float[Tensor, "H W 3"]]:
+    """The loader's, of full size, made as large as the first at a width of `size` pixels; outlines of resized frames have
+    lost their background."""
+    moments = all_moments(loader.subject)
+    width, height = loader.subject.image_size(size, moments[0])
+    return (fitted(frame.image, height, width) for frame in loader.frames(moments))
 
 
 def fitted(picture: Float[Tensor, "h w 3"], height: int, width: int) -> Float[Tensor, "H W 3"]:

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ from small_runs import SMALL
 from tracked_folder import write_tracked_folder
 
 from avatar.commands.groups import GROUPS
+from avatar.data.read_image import read_image
+from avatar.files.video import MIN_CAPTION
 from avatar.runs.checkpoint import list_checkpoints, newest_checkpoint
 
 
@@ -83,6 +86,14 @@ def test_reenact_gives_as_many_frames_as_the_driver_has(
     assert ("Neutral expression: frame" in output) == (transfer in ("relative", "pca"))
     render = frames[:, :40, frames.shape[2] // 2 :]
     assert render.reshape(8, -1).std(axis=1).min() > 5, "the render is empty"
+
+
+def test_reenact_shows_the_drivers_picture_as_the_video_has_it(trained: Path, driver: Path, tmp_path: Path) -> None:
+    avatar("reenact", trained, "--driver", driver, "--frame-offset", 1, "--out", tmp_path / "panel.png")
+    panel = read_image(min(tmp_path.glob("*.png")))
+    whole = read_image(min(driver.glob("imgs/*"))).astype(np.float32)
+    shown = panel[MIN_CAPTION : MIN_CAPTION + 40, :40]
+    assert np.abs(shown - cv2.resize(whole, (40, 40), interpolation=cv2.INTER_AREA)).max() <= 1
 
 
 def test_reenact_records_every_choice_and_each_frames_distance(trained: Path, driver: Path, tmp_path: Path) -> None:

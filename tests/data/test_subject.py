@@ -200,7 +200,7 @@ def test_the_composite_of_resized_frames_is_the_resized_composite(
     subject, over = Subject.open(prepared), torch.tensor(background)
 
     small = pixels.resized(size)
-    assert [plane.shape[:2] for plane in small] == 4 * [size[::-1]] and {plane.dtype for plane in small} == {np.dtype(np.uint8)}
+    assert [(plane.shape[:2], plane.dtype) for plane in small] == 4 * [(size[::-1], np.uint8)]
     full = subject.assemble(0, pixels).composite(over).numpy()
     expected = torch.from_numpy(cv2.resize(full, size, interpolation=cv2.INTER_AREA))
     composite = subject.assemble(0, small, size[0]).composite(over)

@@ -6,7 +6,7 @@ from heads import OPEN, grid_head, mouth_head, rest_params
 
 from avatar.head.model import HeadModel
 from avatar.motion.neutral_pose import RestPose, find_mean, frame_rest
-from avatar.pipeline.reenact import panels, say_open_lips
+from avatar.pipeline.reenact import fitted, panels, say_open_lips
 
 
 def neutral(opening: float) -> RestPose:
@@ -40,8 +40,8 @@ def test_nothing_is_said_of_means_of_no_rest_and_of_heads_without_lips() -> None
 
 def test_panels_are_of_one_size_where_another_camera_stands_in_for_the_first_one() -> None:
     renders = iter([torch.zeros(64, 48, 3)] * 3)
-    pictures = [torch.zeros(64, 48, 3), torch.zeros(36, 48, 3), torch.zeros(96, 48, 3)]
-    first, wide, tall = panels(renders, iter(pictures), "anna", [0.5, 0.5, 0.5])
+    pictures = (fitted(torch.zeros(rows, 48, 3), 64, 48) for rows in (64, 36, 96))
+    first, wide, tall = panels(renders, pictures, "anna", [0.5, 0.5, 0.5])
     assert first.shape == wide.shape == tall.shape
     dark = [(panel[-100:, :48] == 0).all(axis=2).sum() for panel in (first, wide, tall)]
     assert [one / dark[0] for one in dark[1:]] == pytest.approx([36 / 64, 64 / 96], abs=0.02)
