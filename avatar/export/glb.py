@@ -52,14 +52,14 @@ def encode_glb(trained: TrainedAvatar, params: HeadParams, size: int, licence: s
 
     def add_targets(buffer_items: Any, tree: dict[str, Any]) -> None:
         (gltf_mesh,) = tree["meshes"]
-        primitive = gltf_mesh["primitives"][0]
-        primitive["targets"] = [
-            {"POSITION": add_accessor(buffer_items, tree, name, moved)} for name, moved in targets.items()
-        ]
-        gltf_mesh["weights"] = [0.0] * len(targets)
         gltf_mesh["name"] = trained.name
         gltf_mesh["extras"] = {"targetNames": list(targets)}
         tree["asset"]["copyright"] = licence
+        if targets:  # glTF allows no empty list of them
+            gltf_mesh["primitives"][0]["targets"] = [
+                {"POSITION": add_accessor(buffer_items, tree, name, moved)} for name, moved in targets.items()
+            ]
+            gltf_mesh["weights"] = [0.0] * len(targets)
 
     data = export_glb(trimesh.Scene(mesh), include_normals=True, buffer_postprocessor=add_targets)
     return data, tuple(targets)

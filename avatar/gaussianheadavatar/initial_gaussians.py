@@ -25,6 +25,7 @@ from avatar.gaussianheadavatar.start_points import (
 from avatar.gaussians.initial_colours import mean_colours, mean_of, seen_at
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import UVTexels
+from avatar.head.features import region_or_all
 from avatar.head.model import HeadModel
 
 REACH = 1.8  # of the grid from the head's centre, half head lengths
@@ -63,7 +64,7 @@ def initial_gaussians(
     rest = count - len(on_mesh)
     in_mouth = round(MOUTH_SHARE * rest)
     outside = spread_points(beyond_mesh(head, embedding, frames, centre, half, fitted), rest - in_mouth)
-    lips = head.neutral_vertices()[head.assets.regions.get("lips", torch.arange(head.assets.num_vertices))]
+    lips = head.neutral_vertices()[region_or_all(head.assets, "lips")]
     mouth = mouth_box(lips, in_mouth, torch.Generator().manual_seed(0))
     positions = torch.cat((on_mesh, outside, mouth))
     shown = (colours, colours_beyond(head, outside, frames, centre), torch.full_like(mouth, MOUTH_COLOUR))

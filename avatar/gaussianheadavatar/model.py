@@ -37,6 +37,7 @@ from avatar.gaussians.base_model import CONDITION_EXTRAS, Avatar, Groups
 from avatar.gaussians.mesh_embedding import Embedding
 from avatar.gaussians.uv import bound_texels
 from avatar.head.assets import HeadAssets
+from avatar.head.features import region_or_all
 from avatar.head.model import matrix_from_6d, nearest_rotation
 from avatar.splat import splat_features
 from avatar.tensors import take_rows
@@ -78,7 +79,7 @@ class GaussianHeadAvatar(Avatar):
         skull = skull if len(skull) else vertices  # a head model whose neck does not bend
         low, high = skull.amin(dim=0), skull.amax(dim=0)
         self.unit = 0.5 * float((high - low)[1])
-        face = assets.regions.get("face", torch.arange(len(vertices)))
+        face = region_or_all(assets, "face")
         self.register_buffer("centre", 0.5 * (low + high), persistent=False)
         self.register_buffer("places", (landmarks(vertices, face) - self.centre) / self.unit, persistent=False)
 

@@ -1,4 +1,4 @@
-"""Where a head model's eyes and mouth are, when it names no regions."""
+"""Where a head model's parts are, also when it names no regions."""
 
 from __future__ import annotations
 
@@ -14,6 +14,12 @@ from avatar.head.assets import EYES, JOINT_NAMES, HeadAssets
 EYE_JOINTS = [JOINT_NAMES.index(name) for name in EYES]
 FACE = 0.12  # metres from the middle between the eyes, on the template: a mouth's opening is nearer, a neck's farther
 BELOW_EYES = 0.03  # metres: farther below them than an eye socket, less far than a mouth
+
+
+def region_or_all(assets: HeadAssets, name: str) -> Int[Tensor, " R"]:
+    """The vertices of a region; all of them where the head model does not name it, or none in it."""
+    region = assets.regions.get(name)
+    return torch.arange(assets.num_vertices) if region is None or len(region) == 0 else region
 
 
 def eyeballs(assets: HeadAssets) -> Int[Tensor, " R"]:

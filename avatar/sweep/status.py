@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from collections import Counter
@@ -71,8 +72,11 @@ class Progress:
 
     def show(self, states: Mapping[str, State], last: bool = False) -> None:
         if self._out.isatty():
-            if last or time.monotonic() - self._last >= self.REDRAW_SECONDS:
+            if last:
                 self._redraw(overview(states, self._workers))
+            elif time.monotonic() - self._last >= self.REDRAW_SECONDS:
+                width, height = shutil.get_terminal_size()  # what is wider or higher could not be rewritten
+                self._redraw([line[: width - 1] for line in overview(states, self._workers)[: height - 1]])
             return
         for name, state in states.items():
             if state.status in ("done", "failed") and self._known.get(name) != state.status:

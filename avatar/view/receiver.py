@@ -65,6 +65,9 @@ class Receiver:
                 self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
                 self._udp.bind((host, self.port))
         except (OSError, OverflowError) as error:
+            if self._udp is not None:  # the port was free for TCP alone
+                self._tcp.close()
+                self._udp.close()
             raise UserError(f"the stream cannot listen on {host}:{port} ({error}); give another --stream") from None
         threading.Thread(target=self._accept, daemon=True, name="stream").start()
         if self._udp is not None:

@@ -169,6 +169,17 @@ def test_a_mesh_has_the_pose_the_texture_and_the_expressions(trained: TrainedAva
     np.testing.assert_allclose(position, mesh.vertices, atol=1e-6)
 
 
+def test_a_mesh_whose_face_never_moved_has_no_empty_lists(trained: TrainedAvatar) -> None:
+    """The schema of glTF asks for one entry or more in each."""
+    rest, count = trained.rest_params(), len(trained.recording)
+    still = {name: getattr(rest, name).expand(count, -1) for name in ("expression", "jaw", "eyes", "eyelids", "neck")}
+    unmoved = replace(trained, recording=replace(trained.recording, tracks={**trained.recording.tracks, **still}))
+    data, names = encode_glb(unmoved, rest, 16, "")
+    (mesh,) = gltf_parts(data)[0]["meshes"]
+    assert names == () and mesh["name"] == trained.name
+    assert "weights" not in mesh and "targets" not in mesh["primitives"][0]
+
+
 def test_a_mesh_is_smooth_where_its_texture_is_cut(trained: TrainedAvatar) -> None:
     tree, buffer = gltf_parts(encode_glb(trained, trained.rest_params(), 16, "")[0])
     attributes = tree["meshes"][0]["primitives"][0]["attributes"]

@@ -169,6 +169,20 @@ def test_masks_that_have_nothing_in_common_get_a_sentence(tracked_folder: Path) 
         avatar.initialize_from([replace(f, alpha=torch.zeros_like(f.alpha)) for f in frames], "frames")
 
 
+def test_a_head_model_with_empty_regions_starts_as_one_without_them(tracked_folder: Path) -> None:
+    config = small_config("model=gaussianheadavatar")
+    _, subject, assets = open_small(tracked_folder, config)
+    others = {name: index for name, index in assets.regions.items() if name not in ("face", "lips")}
+    empty = dict.fromkeys(("face", "lips"), torch.zeros(0, dtype=torch.int64))
+    frames, found = [subject.frame(i) for i in subject.split.train[:4]], []
+    for regions in (others, others | empty):
+        avatar = new_avatar(replace(assets, regions=regions), subject, config)
+        assert isinstance(avatar, GaussianHeadAvatar)
+        avatar.initialize_from(frames, "frames")
+        found.append(avatar.state_dict()["positions"])
+    torch.testing.assert_close(*found, rtol=0, atol=0)
+
+
 def test_a_head_model_whose_neck_does_not_bend_is_as_long_as_all_of_it() -> None:
     assets = grid_head()
     stiff = replace(assets, weights=torch.eye(5)[:1].expand_as(assets.weights).contiguous())  # all on the root

@@ -237,9 +237,10 @@ def test_a_damaged_eyelid_file_is_named(head_dir: Path, content: bytes, message:
         load_head_assets(head_dir)
 
 
-def test_a_region_outside_the_model_is_named(head_dir: Path) -> None:
-    np.savez(head_dir / "masks.npz", lips=np.array([1, 63]))
-    with pytest.raises(UserError, match="region lips names vertex 63, but the model has 63"):
+@pytest.mark.parametrize("vertex", [63, -1])
+def test_a_region_outside_the_model_is_named(vertex: int, head_dir: Path) -> None:
+    np.savez(head_dir / "masks.npz", lips=np.array([1, vertex]))
+    with pytest.raises(UserError, match=f"region lips names vertex {vertex}, but the model has 63"):
         load_head_assets(head_dir)
 
 

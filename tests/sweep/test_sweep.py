@@ -178,6 +178,18 @@ def test_progress_says_when_all_will_be_over_and_rewrites_only_its_own_lines() -
     assert re.findall(r"\x1b\[\d+A", out.getvalue()) == ["\x1b[4A"]
 
 
+def test_progress_is_cut_to_the_terminal_until_its_last_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cursor goes up by as many lines as were written, not by those that a terminal broke them into."""
+    monkeypatch.setenv("COLUMNS", "40")
+    monkeypatch.setenv("LINES", "4")
+    states = {f"job{n}": State("failed", 3, sentence="long" * 30) for n in range(9)}
+    Progress(out=(out := Terminal())).show(states)
+    lines = re.sub(r"\x1b\[\d*\w", "", out.getvalue()).splitlines()
+    assert len(lines) == 3 and all(len(line) < 40 for line in lines)
+    Progress(out=(out := Terminal())).show(states, last=True)
+    assert out.getvalue().count("long" * 30) == 9
+
+
 def test_a_worker_that_fell_silent_is_replaced(tmp_path: Path) -> None:
     write_state(tmp_path, State("running", 1, "elsewhere:1"))
     assert read_state(tmp_path).status == "waiting", "a running job without a heartbeat has no worker"

@@ -195,3 +195,13 @@ def test_departures_begin_at_the_avatars_own_neutral_face(receiver: Receiver, na
 def test_a_port_that_is_taken(receiver: Receiver, named_avatar: TrainedAvatar) -> None:
     with pytest.raises(UserError, match="the stream cannot listen on 127.0.0.1"):
         Receiver(named_avatar, receiver.port)
+
+
+def test_a_port_that_is_taken_for_udp_alone_is_let_go_of(named_avatar: TrainedAvatar) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        with pytest.raises(UserError, match="another --stream") as refused:
+            Receiver(named_avatar, port)
+        socket.create_server(("127.0.0.1", port)).close()
+    assert refused.value.__traceback__ is not None, "it keeps the receiver alive"

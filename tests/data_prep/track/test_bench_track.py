@@ -71,6 +71,14 @@ def test_errors_are_shares_of_the_distance_between_the_eyes(truth: Recording, as
     assert off.all == pytest.approx(off.moving, rel=0.02)
 
 
+@pytest.mark.parametrize("regions", [{}, {"face": torch.zeros(0, dtype=torch.int64)}])
+def test_a_head_model_that_names_no_face_is_measured_everywhere(
+    regions: dict[str, torch.Tensor], truth: Recording, assets: HeadAssets
+) -> None:
+    pairs = [(n, n) for n in range(FRAMES)]
+    assert placement(replace(assets, regions=regions), truth, truth, pairs) == Placement(0.0, 0.0)
+
+
 def test_what_is_the_same_in_all_frames_is_told_apart() -> None:
     residuals = np.zeros((2, 1, 2))
     residuals[:, 0] = [[3.0, 5.0], [3.0, 3.0]]
