@@ -26,7 +26,7 @@ from data_prep.track.footage.source import (
 from data_prep.track.footage.tone_mapping import HDR_TRANSFERS, assumed_matrix, tone_filters
 
 _INPUT = re.compile(r"Input #0, (\S+), from")
-_STREAM = re.compile(r"Stream #0:(\d+)(?:\[0x[0-9a-f]+\])?(?:\(\w+\))?: (\w+): (.*)")
+_STREAM = re.compile(r"Stream #0:(\d+)(?:\[0x[0-9a-f]+\])?(?:\([^)]*\))?: (\w+): (.*)")
 _SIZE = re.compile(r", (\d{1,6})x(\d{1,6})\b")
 _DURATION = re.compile(r"Duration: (\d+):(\d\d):(\d\d\.\d+)")
 _FOCAL = re.compile(r"focal_?length\.?(?:_in_)?_?35_?mm\w*(?:\.?\w+)*\s*: ([\d.]+)", re.IGNORECASE)

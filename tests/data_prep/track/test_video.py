@@ -194,6 +194,11 @@ def test_the_largest_of_several_videos_is_used(tmp_path: Path) -> None:
     )
 
 
+def test_a_language_with_a_region_hides_no_pictures(tmp_path: Path) -> None:
+    encode(tmp_path / "a.mkv", still(3), options=("-metadata:s:v:0", "language=en-US", *X264))
+    assert len(read(tmp_path / "a.mkv")[0]) == 3
+
+
 def test_a_changing_size_is_refused(tmp_path: Path) -> None:
     first, second = encode(tmp_path / "a.ts", still()), encode(tmp_path / "b.ts", counting(5))
     (tmp_path / "c.ts").write_bytes(first.read_bytes() + second.read_bytes())
