@@ -78,6 +78,10 @@ class Clip:
         """How the user knows a frame: by its number, or by its image's name where a listing has the frames."""
         return self._listed_names.get(number, f"{number:05d}")
 
+    def image_name(self, number: int) -> str:
+        """The name of the image's file; the frame's where the images lie in several folders, which may have equal names."""
+        return self.files.images[number].name if self.files.is_one_folder else self.name(number)
+
     def names(self, numbers: Iterable[int]) -> tuple[str, ...]:
         return tuple(self.name(number) for number in numbers)
 
