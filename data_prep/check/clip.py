@@ -162,8 +162,9 @@ def read_clip(
         lambda message: complaints.append(("layout", message)),
         one_camera,
     )
+    whole = open_tracked_folder(given.folder, given.tracking, given.data_format, lambda _: None, given.cameras)
     files, label_notes = with_labels(source.files)
-    source = replace(source, files=files)
+    source = replace(source, files=files, notes=whole.notes)  # of all cameras that are chosen
     for check, refuse in (
         ("frame-offset", lambda: source.refuse_offset(given.frame_offset)),
         ("mask-range", lambda: refuse_colours(files)),
@@ -195,7 +196,7 @@ def read_clip(
         offset,
         evidence,
         None,
-        _count_cameras(given),
+        max(1, len({shot.camera for shot in whole.shots.values()})),
         views,
         steps=steps,
     )
@@ -204,11 +205,6 @@ def read_clip(
     if not source.is_paired:
         clip = _with_offset(clip, head)
     return replace(clip, fits=_measure_fits(clip, head, progress))
-
-
-def _count_cameras(given: Source) -> int:
-    whole = open_tracked_folder(given.folder, given.tracking, given.data_format, lambda _: None, given.cameras)
-    return max(1, len({shot.camera for shot in whole.shots.values()}))
 
 
 def _read_tracking(

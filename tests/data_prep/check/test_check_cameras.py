@@ -50,6 +50,12 @@ def test_a_rig_that_is_right_has_no_finding(rig: Path) -> None:
     check = checked(rig)
     assert not [finding for finding in check.findings if finding.check.startswith("camera")]
     assert check.clip is not None and len(check.clip.files.images) == TIMES  # of the front camera
+    assert not found(check, "format")  # all cameras are used
+
+
+def test_the_cameras_that_are_used_are_those_that_were_named(rig: Path) -> None:
+    (said,) = found(checked(rig, cameras="07,12"), "format")
+    assert "of the folder's 3 cameras 07, 12 are used" in said
 
 
 def turn(entry: dict[str, Any], degrees: float) -> None:
