@@ -241,8 +241,8 @@ def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
             if len(index) == V and np.isin(index, (0, 1)).all():  # 0 or 1 for every vertex, no indices
                 index = np.flatnonzero(index)
             index = np.unique(index)
-            if index.size and (index[0] < 0 or index[-1] >= V):
-                raise UserError(f"{file}: the region {region} names vertex {index[-1]}, but the model has {V} vertices")
+            if len(outside := index[(index < 0) | (index >= V)]):
+                raise UserError(f"{file}: the region {region} names vertex {outside[0]}, but the model has {V} vertices")
             regions[str(region)] = torch.from_numpy(index)
         return regions
     return {}
