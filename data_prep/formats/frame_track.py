@@ -134,7 +134,8 @@ def _fitted(values: np.ndarray, count: int, what: str, notes: list[str]) -> np.n
 
 
 def vector(value: Any, name: str, count: int | None = None) -> np.ndarray:
-    """`value` as a float64 vector [count]. Raises BadFrame with `name` when it is not that many finite numbers."""
+    """`value` as a float64 vector [count]. Raises BadFrame with `name` when it is not that many numbers that are finite in
+    float32, in which tracks are kept."""
     try:
         array = np.asarray(value)
     except ValueError:  # lists of different lengths
@@ -145,8 +146,9 @@ def vector(value: Any, name: str, count: int | None = None) -> np.ndarray:
         values = array.astype(np.float64).ravel()
     if count is not None and len(values) != count:
         raise BadFrame(f"{name} has {len(values)} values, not {count}")
-    if not np.isfinite(values).all():
-        raise BadFrame(f"{name} is not finite ({int((~np.isfinite(values)).sum())} of {len(values)} values)")
+    is_finite = np.abs(values) <= np.finfo(np.float32).max
+    if not is_finite.all():
+        raise BadFrame(f"{name} is not finite ({int((~is_finite).sum())} of {len(values)} values)")
     return values
 
 
