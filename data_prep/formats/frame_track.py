@@ -85,8 +85,8 @@ def read_frames(
         of_camera: dict[str, dict[int, FrameTrack]] = {}
         for number, frame in frames.items():
             of_camera.setdefault("" if cameras is None else cameras[number], {})[number] = frame
-        for own in of_camera.values():
-            _check_camera(own, paths, flaws, complain)
+        for camera, own in of_camera.items():
+            _check_camera(own, paths, flaws, complain, f" of camera {camera}" if camera else "")
             lens = next(iter(own.values())).intrinsics
             frames |= {number: replace(frame, intrinsics=lens) for number, frame in own.items()}
         frames = dict(sorted(frames.items()))
@@ -187,7 +187,11 @@ def nearest_rotation(R: np.ndarray, name: str) -> np.ndarray:
 
 
 def _check_camera(
-    frames: dict[int, FrameTrack], paths: dict[int, Path], flaws: list[str], complain: Callable[[str], object]
+    frames: dict[int, FrameTrack],
+    paths: dict[int, Path],
+    flaws: list[str],
+    complain: Callable[[str], object],
+    of_camera: str,
 ) -> None:
     first_number, first = next(iter(frames.items()))
     worst, worst_number = 0.0, first_number
@@ -203,13 +207,15 @@ def _check_camera(
         if change > worst:
             worst, worst_number = change, number
     if worst > INTRINSICS_NOTE:
-        both = " and ".join(
-            f"{paths[n].name} has fx fy cx cy = {' '.join(f'{v:.2f}' for v in frames[n].intrinsics)}"
+        both = "fx fy cx cy = " + " and ".join(
+            f"{' '.join(f'{v:.2f}' for v in frames[n].intrinsics)} with {paths[n].name}"
             for n in (first_number, worst_number)
         )
         focals = [frame.intrinsics[0] for frame in frames.values()]
         both += f"; fx goes from {min(focals):.2f} to {max(focals):.2f}"
         if worst > 1:
-            complain(f"the intrinsics change within the clip: {both}; track it again with one fixed camera")
+            complain(f"the intrinsics{of_camera} change within the clip: {both}; track it again with one fixed camera")
         else:
-            flaws.append(f"the intrinsics change a little within the clip ({both}); those of the first frame are used")
+            flaws.append(
+                f"the intrinsics{of_camera} change a little within the clip ({both}); those of the first frame are used"
+            )

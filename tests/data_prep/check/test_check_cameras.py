@@ -77,6 +77,21 @@ def test_a_camera_that_moves_is_named(rig: Path, tmp_path: Path) -> None:
     assert "camera 12 moves against camera 08" in problem and check.status == 2
 
 
+@pytest.mark.parametrize(("camera", "check"), [("07", "camera"), ("08", "tracking")])
+def test_a_lens_that_changes_is_an_error_by_whichever_camera(
+    camera: str, check: str, rig: Path, tmp_path: Path
+) -> None:
+    def zoom(entry: dict[str, Any]) -> None:
+        if entry["camera_id"] == camera and entry["timestep_index"] == 3:
+            entry["fl_x"] *= 1.2
+
+    folder = copied(rig, tmp_path / "copy", zoom)
+    (problem,) = (finding.problem for finding in checked(folder).findings if finding.severity == "error")
+    assert found(checked(folder), check) == [problem] and "with 00003.npz" in problem
+    with pytest.raises(UserError, match=f"the intrinsics of camera {camera} change"):
+        opened(folder, tmp_path / "out")
+
+
 def test_a_camera_whose_clock_is_off_is_named(rig: Path, tmp_path: Path) -> None:
     def behind(entry: dict[str, Any]) -> None:
         if entry["camera_id"] == "07":
