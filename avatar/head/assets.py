@@ -242,7 +242,9 @@ def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
                 index = np.flatnonzero(index)
             index = np.unique(index)
             if len(outside := index[(index < 0) | (index >= V)]):
-                raise UserError(f"{file}: the region {region} names vertex {outside[0]}, but the model has {V} vertices")
+                raise UserError(
+                    f"{file}: the region {region} names vertex {outside[0]}, but the model has {V} vertices"
+                )
             regions[str(region)] = torch.from_numpy(index)
         return regions
     return {}
