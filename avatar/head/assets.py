@@ -241,7 +241,7 @@ def _read_regions(folder: Path, V: int) -> dict[str, Tensor]:
             if len(index) == V and np.isin(index, (0, 1)).all():  # 0 or 1 for every vertex, no indices
                 index = np.flatnonzero(index)
             index = np.unique(index)
-            if (outside := index[(index < 0) | (index >= V)]).size:
+            if len(outside := index[(index < 0) | (index >= V)]):
                 raise UserError(
                     f"{file}: the region {region} names vertex {outside[0]}, but the model has {V} vertices"
                 )

@@ -45,7 +45,10 @@ def check_cameras(clip: Clip, assets: HeadAssets, size: tuple[int, int]) -> list
     bad: dict[int, str] = {}
     findings: list[Finding] = []
     try:
-        tracking = source.read(assets, size, lambda _: None)
+        complaints: list[str] = []
+        tracking = source.read(assets, size, complaints.append)
+        if not any(check == "tracking" for check, _ in clip.complaints):  # else they may be of the clip's own camera
+            findings += [from_sentence("camera", sentence) for sentence in complaints]
         findings += _unusable(source, tracking, clip)
         own = set(clip.files.images.values())  # whose findings are made elsewhere
         others = _with_files(files, {number: number for number, path in files.images.items() if path not in own})

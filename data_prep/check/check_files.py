@@ -129,9 +129,8 @@ def _partners(clip: Clip) -> Iterator[Finding]:
         at_ends = not other or all(n < min(other) or n > max(other) for n in alone)
         is_refused = len(alone) > max(clip.given.max_left_out * len(have), RADIUS)
         severity = "error" if is_refused else "note" if at_ends else "warning"
-        shown = ", ".join(have[n].name for n in alone[:_SHOWN]) + (
-            f" and {len(alone) - _SHOWN} more" if len(alone) > _SHOWN else ""
-        )
+        names = [clip.name(n) if clip.source.is_paired else have[n].name for n in alone[:_SHOWN]]
+        shown = ", ".join(names) + (f" and {len(alone) - _SHOWN} more" if len(alone) > _SHOWN else "")
         yield Finding(
             severity,
             "unpaired",

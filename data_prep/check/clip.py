@@ -78,6 +78,10 @@ class Clip:
         """How the user knows a frame: by its number, or by its image's name where a listing has the frames."""
         return self._listed_names.get(number, f"{number:05d}")
 
+    def image_name(self, number: int) -> str:
+        """The name of the image's file; the frame's where the images lie in several folders, which may have equal names."""
+        return self.files.images[number].name if self.files.is_one_folder else self.name(number)
+
     def names(self, numbers: Iterable[int]) -> tuple[str, ...]:
         return tuple(self.name(number) for number in numbers)
 
@@ -158,8 +162,9 @@ def read_clip(
         lambda message: complaints.append(("layout", message)),
         one_camera,
     )
+    whole = open_tracked_folder(given.folder, given.tracking, given.data_format, lambda _: None, given.cameras)
     files, label_notes = with_labels(source.files)
-    source = replace(source, files=files)
+    source = replace(source, files=files, notes=whole.notes)  # of all cameras that are chosen
     for check, refuse in (
         ("frame-offset", lambda: source.refuse_offset(given.frame_offset)),
         ("mask-range", lambda: refuse_colours(files)),
@@ -191,7 +196,7 @@ def read_clip(
         offset,
         evidence,
         None,
-        _count_cameras(given),
+        max(1, len({shot.camera for shot in whole.shots.values()})),
         views,
         steps=steps,
     )
@@ -200,11 +205,6 @@ def read_clip(
     if not source.is_paired:
         clip = _with_offset(clip, head)
     return replace(clip, fits=_measure_fits(clip, head, progress))
-
-
-def _count_cameras(given: Source) -> int:
-    whole = open_tracked_folder(given.folder, given.tracking, given.data_format, lambda _: None, given.cameras)
-    return max(1, len({shot.camera for shot in whole.shots.values()}))
 
 
 def _read_tracking(

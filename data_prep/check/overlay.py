@@ -95,7 +95,7 @@ def outline(canvas: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) 
 
 
 def _caption(clip: Clip, number: int) -> str:
-    name = f"{clip.files.images[number].name}"
+    name = clip.image_name(number)
     fit = clip.fits.get(number)
     if fit is None:
         return name

@@ -85,7 +85,7 @@ def write_frames(clip: Clip, path: Path) -> None:
             fit = [getattr(clip.fits.get(number), name, None) for name in _FIT_COLUMNS]
             values = (clip.steps.get(number), *matte, *fit)
             cells = ("" if v is None or np.isnan(v) else f"{v:.5f}" for v in values)
-            writer.writerow((clip.files.images[number].name, *cells))
+            writer.writerow((clip.image_name(number), *cells))
 
 
 def _findings(check: Check) -> list[Markup]:

@@ -28,21 +28,22 @@ def open_tracked_folder(
 ) -> TrackedFolder:
     """The folder in the form that `prepare` works on; `format` is one of FORMATS, or None to tell it from the files.
 
-    cameras  of a folder with several: "all", "front" or names between commas
+    cameras  of a folder with several: "all", "front" or names between commas; None: all
 
     Raises UserError when the folder is in none of the formats, or in several, or not in the one that was asked for.
     What is wrong with the files of a metrical-tracker folder goes to `complain`, as in `find_frame_files`.
     """
+    cameras = ALL if cameras is None else cameras
     if format not in (None, *FORMATS):
         raise UserError(f"--data-format must be one of {', '.join(FORMATS)}, not {format!r}")
     if format == avatar_track.NAME or (format is None and avatar_track.recognise(folder)):
         if tracking is not None:
             raise UserError("--tracking is for .frame files; a folder of avatar track holds its own tracking")
-        return refined_folder.open_folder(folder, cameras or ALL)
+        return refined_folder.open_folder(folder, cameras)
     is_listed = folder.is_dir() and (format is None or format in _LISTED)
     frames = read_listings(folder) if is_listed else []
     name = format or detect_format(folder, frames)
-    if cameras not in (None, ALL, FRONT) and name not in (vhap.NAME, nersemble.NAME):
+    if cameras not in (ALL, FRONT) and name not in (vhap.NAME, nersemble.NAME):
         raise UserError(f"--cameras is for folders of several cameras, and {folder} is {name}'s, of one")
     if name == METRICAL_TRACKER:
         files = find_frame_files(folder, tracking, complain)
@@ -61,9 +62,9 @@ def open_tracked_folder(
         where = "is in the folder itself" if name in _BY_FILES else "is named by the listing"
         raise UserError(f"--tracking is for .frame files; in a folder of {name}'s the tracking {where}")
     if name == vhap.NAME:
-        return vhap.open_folder(folder, frames, cameras or ALL)
+        return vhap.open_folder(folder, frames, cameras)
     if name == nersemble.NAME:
-        return nersemble.open_folder(folder, cameras or ALL)
+        return nersemble.open_folder(folder, cameras)
     if name in _BY_FILES:
         return _BY_FILES[name].open_folder(folder)
     return _LISTED[name].open_folder(folder, frames)

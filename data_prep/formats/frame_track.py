@@ -85,8 +85,8 @@ def read_frames(
         of_camera: dict[str, dict[int, FrameTrack]] = {}
         for number, frame in frames.items():
             of_camera.setdefault("" if cameras is None else cameras[number], {})[number] = frame
-        for own in of_camera.values():
-            _check_camera(own, paths, flaws, complain)
+        for camera, own in of_camera.items():
+            _check_camera(own, paths, flaws, complain, f" of camera {camera}" if camera else "")
             lens = next(iter(own.values())).intrinsics
             frames |= {number: replace(frame, intrinsics=lens) for number, frame in own.items()}
         frames = dict(sorted(frames.items()))
@@ -134,7 +134,8 @@ def _fitted(values: np.ndarray, count: int, what: str, notes: list[str]) -> np.n
 
 
 def vector(value: Any, name: str, count: int | None = None) -> np.ndarray:
-    """`value` as a float64 vector [count]. Raises BadFrame with `name` when it is not that many finite numbers."""
+    """`value` as a float64 vector [count]. Raises BadFrame with `name` when it is not that many numbers that are finite in
+    float32, in which tracks are kept."""
     try:
         array = np.asarray(value)
     except ValueError:  # lists of different lengths
@@ -145,8 +146,9 @@ def vector(value: Any, name: str, count: int | None = None) -> np.ndarray:
         values = array.astype(np.float64).ravel()
     if count is not None and len(values) != count:
         raise BadFrame(f"{name} has {len(values)} values, not {count}")
-    if not np.isfinite(values).all():
-        raise BadFrame(f"{name} is not finite ({int((~np.isfinite(values)).sum())} of {len(values)} values)")
+    is_finite = np.abs(values) <= np.finfo(np.float32).max
+    if not is_finite.all():
+        raise BadFrame(f"{name} is not finite ({int((~is_finite).sum())} of {len(values)} values)")
     return values
 
 
@@ -185,7 +187,11 @@ def nearest_rotation(R: np.ndarray, name: str) -> np.ndarray:
 
 
 def _check_camera(
-    frames: dict[int, FrameTrack], paths: dict[int, Path], flaws: list[str], complain: Callable[[str], object]
+    frames: dict[int, FrameTrack],
+    paths: dict[int, Path],
+    flaws: list[str],
+    complain: Callable[[str], object],
+    of_camera: str,
 ) -> None:
     first_number, first = next(iter(frames.items()))
     worst, worst_number = 0.0, first_number
@@ -201,13 +207,15 @@ def _check_camera(
         if change > worst:
             worst, worst_number = change, number
     if worst > INTRINSICS_NOTE:
-        both = " and ".join(
-            f"{paths[n].name} has fx fy cx cy = {' '.join(f'{v:.2f}' for v in frames[n].intrinsics)}"
+        both = "fx fy cx cy = " + " and ".join(
+            f"{' '.join(f'{v:.2f}' for v in frames[n].intrinsics)} with {paths[n].name}"
             for n in (first_number, worst_number)
         )
         focals = [frame.intrinsics[0] for frame in frames.values()]
         both += f"; fx goes from {min(focals):.2f} to {max(focals):.2f}"
         if worst > 1:
-            complain(f"the intrinsics change within the clip: {both}; track it again with one fixed camera")
+            complain(f"the intrinsics{of_camera} change within the clip: {both}; track it again with one fixed camera")
         else:
-            flaws.append(f"the intrinsics change a little within the clip ({both}); those of the first frame are used")
+            flaws.append(
+                f"the intrinsics{of_camera} change a little within the clip ({both}); those of the first frame are used"
+            )

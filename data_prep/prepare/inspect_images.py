@@ -13,6 +13,8 @@ import numpy as np
 from avatar.compute.processors import processor_count
 from avatar.data.read_image import read_bytes, read_image
 from avatar.errors import UserError
+from data_prep.formats import face_parsing
+from data_prep.formats.face_parsing import mask_of
 from data_prep.formats.frame_files import ALPHA, HEAD, IMAGE, MOUTH, PARSING, TRACKING, FrameFiles
 from data_prep.formats.frame_track import Tracking
 from data_prep.formats.tracked_folder import Shot
@@ -40,7 +42,7 @@ class Inspection:
 class _Seen:
     digest: bytes
     size: tuple[int, int]  # width, height; (0, 0) where undecodable
-    darkest: int
+    darkest: int  # of a face parsing's head mask
     brightest: int
     problem: str | None
 
@@ -146,6 +148,7 @@ def _look_at(files: FrameFiles, kind: str, paths: Mapping[int, Path]) -> dict[in
         try:
             data = read_bytes(path)
             pixels = files.decode(kind, data, path)
+            pixels = mask_of(pixels, face_parsing.HEAD) if kind == PARSING else pixels
         except UserError as error:
             return _Seen(hashlib.blake2b(data, digest_size=16).digest(), (0, 0), 0, 0, str(error))
         height, width = pixels.shape[:2]

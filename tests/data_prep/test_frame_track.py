@@ -62,6 +62,7 @@ def test_a_rigid_motion_ends_with_0_0_0_1() -> None:
         ([1.0], "x has 1 values, not 2"),
         ([1.0, np.nan], r"x is not finite \(1 of 2 values\)"),
         ([np.inf, -np.inf], r"x is not finite \(2 of 2 values\)"),
+        ([3e38, -1e39], r"x is not finite \(1 of 2 values\)"),  # in float32
     ],
 )
 def test_values_that_are_not_so_many_finite_numbers_are_refused(value: object, sentence: str) -> None:

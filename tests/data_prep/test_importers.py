@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from exports import write_imavatar, write_insta, write_vhap
-from importing import FRAMES, SIZE, assert_same_pictures, import_folder
+from importing import FRAMES, HEIGHT, SIZE, assert_same_pictures, import_folder
 
 from avatar.data.subject import Subject
 from avatar.errors import UserError
@@ -159,6 +159,13 @@ def test_one_bad_parameter_file_is_left_out_and_two_are_refused(tracked: Path, t
     assert subject.split.train == tuple(range(15)) and any(s.startswith("warning: left out 1 of 24") for s in said)
     with pytest.raises(UserError, match=r"2 of 24 tracking files .*00004, 00007 \(expr is not finite \(100 of 100"):
         import_folder(write_vhap(tracked, tmp_path / "two", edit=spoil(4, 7)), tracked, tmp_path / "out2")
+
+
+def test_a_face_parsing_that_shows_clothes_alone_is_left_out(tracked: Path, tmp_path: Path) -> None:
+    folder = write_imavatar(tracked, tmp_path / "imavatar")
+    assert cv2.imwrite(str(folder / "semantic" / "5.png"), np.full((HEIGHT, SIZE), 16, np.uint8))
+    subject, _ = import_folder(folder, tracked, tmp_path / "out")
+    assert list(subject.manifest.left_out) == ["5"] and "5.png is empty" in subject.manifest.left_out["5"]
 
 
 def test_pickled_objects_in_a_parameter_file_are_refused(tracked: Path, tmp_path: Path) -> None:

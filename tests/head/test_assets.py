@@ -237,10 +237,10 @@ def test_a_damaged_eyelid_file_is_named(head_dir: Path, content: bytes, message:
         load_head_assets(head_dir)
 
 
-@pytest.mark.parametrize("vertex", [63, -1])
-def test_a_region_outside_the_model_is_named(vertex: int, head_dir: Path) -> None:
-    np.savez(head_dir / "masks.npz", lips=np.array([1, vertex]))
-    with pytest.raises(UserError, match=f"region lips names vertex {vertex}, but the model has 63"):
+@pytest.mark.parametrize(("indices", "outside"), [([1, 63], 63), ([-2, 1], -2)])
+def test_a_region_outside_the_model_is_named(head_dir: Path, indices: list[int], outside: int) -> None:
+    np.savez(head_dir / "masks.npz", lips=np.array(indices))
+    with pytest.raises(UserError, match=f"region lips names vertex {outside}, but the model has 63"):
         load_head_assets(head_dir)
 
 

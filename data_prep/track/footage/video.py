@@ -26,11 +26,12 @@ from data_prep.track.footage.source import (
 from data_prep.track.footage.tone_mapping import HDR_TRANSFERS, assumed_matrix, tone_filters
 
 _INPUT = re.compile(r"Input #0, (\S+), from")
-_STREAM = re.compile(r"Stream #0:(\d+)(?:\[0x[0-9a-f]+\])?(?:\(\w+\))?: (\w+): (.*)")
+_STREAM = re.compile(r"Stream #0:(\d+)(?:\[0x[0-9a-f]+\])?(?:\([^)]*\))?: (\w+): (.*)")
 _SIZE = re.compile(r", (\d{1,6})x(\d{1,6})\b")
 _DURATION = re.compile(r"Duration: (\d+):(\d\d):(\d\d\.\d+)")
 _FOCAL = re.compile(r"focal_?length\.?(?:_in_)?_?35_?mm\w*(?:\.?\w+)*\s*: ([\d.]+)", re.IGNORECASE)
 _TRANSPARENT = re.compile(r"rgba|bgra|argb|abgr|yuva|gbrap|ya8|ya16|pal8")
+_NO_INDEX = {"mpegts", "mpeg"}  # demuxers that guess where a time is: pictures after it are lost, or of another time
 _LISTS = {"concat", "hls", "dash", "sdp", "rtsp", "imf"}  # demuxers that open other files
 _TEXT = {"tty", "srt", "webvtt", "ass", "lrc", "microdvd"}  # that take any text
 _MAX_LISTED_ERRORS = 3
@@ -127,11 +128,12 @@ def open_video(path: Path) -> Video:
     container = _INPUT.search(said)
     if container is None:
         raise UserError(_unreadable(path, said))
-    if _LISTS & set(container[1].split(",")):
+    kinds = set(container[1].split(","))
+    if _LISTS & kinds:
         raise UserError(
             f"{path} is a list of other files ({container[1].strip(',')}), not a video; give the video itself"
         )
-    if _TEXT & set(container[1].split(",")):
+    if _TEXT & kinds:
         raise UserError(f"{path} is a text, not a video; give a video of a person")
     streams = [(int(n), kind, rest) for n, kind, rest in _STREAM.findall(said)]
     videos = [(n, rest) for n, kind, rest in streams if kind == "Video" and "(attached pic)" not in rest]
@@ -150,7 +152,7 @@ def open_video(path: Path) -> Video:
     first, colour = found
     width, height = _square_size(first)
     check_size(path, width, height)
-    duration, rate = _DURATION.search(said), rate_of(rest)
+    duration, rate = None if _NO_INDEX & kinds else _DURATION.search(said), rate_of(rest)
     focal = _FOCAL.search(said)
     return Video(
         path=path,

@@ -28,6 +28,7 @@ from data_prep.track.upright import LONGEST, sample_pictures
 
 OPAQUE = 0.5  # of the face: less is not the person's matte
 _SAMPLES = 16  # pictures of a video of mattes
+_SAME_RATE = 5e-4  # relative: rates are said to a hundredth
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,12 @@ def open_mattes(path: Path, video: Footage, span: Span | None = None) -> OwnMatt
         duration = len(footage.files) / rate
         as_masks = replace(footage, decode=_mask_reader(label), rate=rate, duration=duration, times=times)
         return OwnMattes(as_masks, tuple(notes))
+    is_part, own_rate, rate = span not in (None, Span()), footage.rate, video.rate
+    if is_part and own_rate and rate and abs(own_rate / rate - 1) > _SAME_RATE:
+        raise UserError(
+            f"the mattes in {path} have {own_rate:g} pictures a second, the video {rate:g}, so that --start and --end are "
+            "at other pictures in each; make them at the video's rate, or give a folder of them"
+        )
     begins, own = (one.first.time or 0.0 if isinstance(one, Video) else 0.0 for one in (video, footage))
     if abs(begins - own) > 0.5 / (video.rate or DEFAULT_FPS):
         notes.append(

@@ -50,6 +50,12 @@ def test_a_rig_that_is_right_has_no_finding(rig: Path) -> None:
     check = checked(rig)
     assert not [finding for finding in check.findings if finding.check.startswith("camera")]
     assert check.clip is not None and len(check.clip.files.images) == TIMES  # of the front camera
+    assert not found(check, "format")  # all cameras are used
+
+
+def test_the_cameras_that_are_used_are_those_that_were_named(rig: Path) -> None:
+    (said,) = found(checked(rig, cameras="07,12"), "format")
+    assert "of the folder's 3 cameras 07, 12 are used" in said
 
 
 def turn(entry: dict[str, Any], degrees: float) -> None:
@@ -69,6 +75,21 @@ def test_a_camera_that_moves_is_named(rig: Path, tmp_path: Path) -> None:
     check = checked(copied(rig, tmp_path / "copy", lambda entry: turn(entry, 0.1 * entry["timestep_index"])))
     (problem,) = found(check, "camera-moves")
     assert "camera 12 moves against camera 08" in problem and check.status == 2
+
+
+@pytest.mark.parametrize(("camera", "check"), [("07", "camera"), ("08", "tracking")])
+def test_a_lens_that_changes_is_an_error_by_whichever_camera(
+    camera: str, check: str, rig: Path, tmp_path: Path
+) -> None:
+    def zoom(entry: dict[str, Any]) -> None:
+        if entry["camera_id"] == camera and entry["timestep_index"] == 3:
+            entry["fl_x"] *= 1.2
+
+    folder = copied(rig, tmp_path / "copy", zoom)
+    (problem,) = (finding.problem for finding in checked(folder).findings if finding.severity == "error")
+    assert found(checked(folder), check) == [problem] and "with 00003.npz" in problem
+    with pytest.raises(UserError, match=f"the intrinsics of camera {camera} change"):
+        opened(folder, tmp_path / "out")
 
 
 def test_a_camera_whose_clock_is_off_is_named(rig: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from collections.abc import Callable
@@ -14,12 +15,15 @@ import pytest
 from check_findings import ALWAYS, new_findings
 from exports import write_imavatar, write_insta, write_vhap
 from folder_damage import FRAMES
+from nha_folder import edit_tracking, write_nha
 from tracked_folder import write_tracked_folder
 
 from avatar.cli import main
 from avatar.data.split import split_frames
 from avatar.head.assets import load_head_assets
 from data_prep.check.folder import Check, check_tracked_folder
+from data_prep.check.overlay import draw_overlays
+from data_prep.check.page import write_frames
 
 WRITERS: dict[str, Callable[..., Path]] = {"VHAP": write_vhap, "INSTA": write_insta, "IMavatar": write_imavatar}
 FILES = {  # what is counted, beside the images
@@ -136,3 +140,18 @@ def test_the_command_takes_the_format(
     assert main(["check", str(exported["IMavatar"]), "--data-format", "INSTA", *options]) == 2
     (finding,) = json.loads(capsys.readouterr().out)["findings"]
     assert finding["check"] == "layout" and "is not a folder of INSTA's" in finding["problem"]
+
+
+def test_frames_whose_images_have_one_name_are_told_apart(tmp_path: Path) -> None:
+    """All images of NHA are called image_0000.png."""
+    count = 12
+    folder = write_nha(tmp_path / "person", count)
+    edit_tracking(folder, lambda rows: rows.update({k: v[2:] for k, v in rows.items() if len(v) == count}))
+    clip = (check := checked(folder, folder)).clip
+    assert clip is not None
+    (unpaired,) = (finding for finding in check.findings if finding.check == "unpaired")
+    assert "frame_0000_image_0000, frame_0001_image_0000" in unpaired.problem
+    write_frames(clip, tmp_path / "frames.csv")
+    with (tmp_path / "frames.csv").open() as file:
+        assert len({row["image"] for row in csv.DictReader(file)}) == count
+    assert len({caption.partition(":")[0] for _, caption in draw_overlays(clip)}) == 8

@@ -254,6 +254,15 @@ def test_mattes_of_a_part_are_of_its_own_pictures(kind: str, tmp_path: Path) -> 
             assert "begin at 0.00 s of their file and the video's pictures at 0.08 s" in " ".join(mattes.notes)
 
 
+def test_a_part_is_not_taken_from_mattes_of_another_rate(tmp_path: Path) -> None:
+    masks = [np.dstack([matte()] * 3)] * 18
+    video = open_footage(encode(tmp_path / "v.mkv", masks, fps="24000/1001", options=LOSSLESS))
+    mattes = encode(tmp_path / "m.mkv", masks, fps=24, options=LOSSLESS)
+    with pytest.raises(UserError, match=r"24 pictures a second, the video 23\.98"):
+        open_mattes(mattes, video, Span(0.3))
+    assert open_mattes(mattes, video).footage.rate == 24
+
+
 def test_times_that_a_file_rounds_do_not_shift_the_mattes_of_a_part(tmp_path: Path) -> None:
     video = encode(tmp_path / "v.mov", [picture(n % 5) for n in range(18)], fps=30, options=LOSSLESS)
     mattes = encode(tmp_path / "m.mkv", [np.dstack([matte(n % 5)] * 3) for n in range(18)], fps=30, options=LOSSLESS)

@@ -147,6 +147,14 @@ def test_times_and_the_part_between_start_and_end(tmp_path: Path) -> None:
         assert not said
 
 
+@pytest.mark.parametrize(("name", "codec"), [("a.ts", "libx264"), ("a.mpg", "mpeg2video")])
+def test_nothing_is_lost_after_a_start_where_there_is_no_index(tmp_path: Path, name: str, codec: str) -> None:
+    encode(tmp_path / name, counting(25) * 4, options=("-c:v", codec, "-g", "12", "-bf", "2"))
+    (whole_clip, _), (part, said) = read(tmp_path / name), read(tmp_path / name, span=Span(2.5))
+    assert [picture.time for picture in part] == [picture.time for picture in whole_clip[63:]] and not said
+    np.testing.assert_array_equal(part[0].image, whole_clip[63].image)
+
+
 def test_a_variable_rate_keeps_its_times(tmp_path: Path) -> None:
     encode(tmp_path / "a.mp4", counting(20), 25)
     late = "setpts='(N+if(gt(N,9),5,0))/25/TB'"
@@ -192,6 +200,11 @@ def test_the_largest_of_several_videos_is_used(tmp_path: Path) -> None:
     assert (video.width, video.stream) == (WIDTH, 1) and video.notes == (
         "the file holds 2 videos: the largest is used",
     )
+
+
+def test_a_language_with_a_region_hides_no_pictures(tmp_path: Path) -> None:
+    encode(tmp_path / "a.mkv", still(3), options=("-metadata:s:v:0", "language=en-US", *X264))
+    assert len(read(tmp_path / "a.mkv")[0]) == 3
 
 
 def test_a_changing_size_is_refused(tmp_path: Path) -> None:

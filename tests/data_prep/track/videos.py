@@ -26,7 +26,7 @@ def ffmpeg(*arguments: str | Path, stdin: bytes | None = None) -> None:
 def encode(
     path: Path,
     pictures: Iterable[np.ndarray],
-    fps: float = 25,
+    fps: float | str = 25,
     options: Sequence[str] = X264,
     before: Sequence[str] = (),
 ) -> Path:
