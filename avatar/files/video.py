@@ -13,6 +13,7 @@ from typing import NamedTuple
 import cv2
 import imageio_ffmpeg
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -173,6 +174,19 @@ def side_by_side(
             picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_LANCZOS4)
         columns.append(np.concatenate((_caption(caption, strip, picture.shape[1]), picture)))
     return np.concatenate(columns, axis=1)
+
+
+def fitted(picture: Float[Tensor, "h w 3"], height: int, width: int) -> Float[Tensor, "H W 3"]:
+    """As large as a picture of this size holds it, over white: where the first camera lacks one, another's stands in."""
+    h, w = picture.shape[:2]
+    if (h, w) == (height, width):
+        return picture
+    scale = min(height / h, width / w)
+    rows, columns = max(1, round(scale * h)), max(1, round(scale * w))
+    top, left, sheet = (height - rows) // 2, (width - columns) // 2, torch.ones(height, width, 3)
+    small = cv2.resize(picture.numpy(), (columns, rows), interpolation=cv2.INTER_AREA)
+    sheet[top : top + rows, left : left + columns] = torch.from_numpy(small)
+    return sheet
 
 
 def padded(panel: UInt8[np.ndarray, "h w 3"], height: int, width: int) -> UInt8[np.ndarray, "H W 3"]:

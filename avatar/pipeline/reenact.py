@@ -9,9 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 from tqdm import tqdm
@@ -22,7 +20,7 @@ from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.names import shortened
 from avatar.files.numbered import numbered, remove_longer
-from avatar.files.video import Sound, side_by_side, write_video
+from avatar.files.video import Sound, fitted, side_by_side, write_video
 from avatar.files.write_image import encode_image
 from avatar.head.model import HeadModel
 from avatar.motion.drive import Drive, Whose, all_moments, choose_cameras, smoothed, subject_drive
@@ -236,24 +234,10 @@ def panels(
 
 
 def driver_pictures(loader: FrameLoader, size: int | None) -> Iterator[Float[Tensor, "H W 3"]]:
-    """The loader's, of full size, made as large as the first at a width of `size` pixels; outlines of resized frames have
-    lost their background."""
+    """As large as the first at a width of `size` pixels; of full frames, for outlines of resized ones lack a background."""
     moments = all_moments(loader.subject)
     width, height = loader.subject.image_size(size, moments[0])
     return (fitted(frame.image, height, width) for frame in loader.frames(moments))
-
-
-def fitted(picture: Float[Tensor, "h w 3"], height: int, width: int) -> Float[Tensor, "H W 3"]:
-    """As large as a picture of this size holds it, over white: where the first camera lacks one, another's stands in."""
-    h, w = picture.shape[:2]
-    if (h, w) == (height, width):
-        return picture
-    scale = min(height / h, width / w)
-    rows, columns = max(1, round(scale * h)), max(1, round(scale * w))
-    top, left, sheet = (height - rows) // 2, (width - columns) // 2, torch.ones(height, width, 3)
-    small = cv2.resize(picture.numpy(), (columns, rows), interpolation=cv2.INTER_AREA)
-    sheet[top : top + rows, left : left + columns] = torch.from_numpy(small)
-    return sheet
 
 
 def describe(

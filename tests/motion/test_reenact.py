@@ -4,9 +4,10 @@ import pytest
 import torch
 from heads import OPEN, grid_head, mouth_head, rest_params
 
+from avatar.files.video import fitted
 from avatar.head.model import HeadModel
 from avatar.motion.neutral_pose import RestPose, find_mean, frame_rest
-from avatar.pipeline.reenact import fitted, panels, say_open_lips
+from avatar.pipeline.reenact import panels, say_open_lips
 
 
 def neutral(opening: float) -> RestPose:
