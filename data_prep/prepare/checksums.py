@@ -27,7 +27,10 @@ def find_damage(folder: Path) -> str | None:
         recorded = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
     except UserError:
         return f"{CONTENTS_FILE} is missing or cannot be read"
-    files = _files(folder)
+    try:
+        files = _files(folder)
+    except OSError as error:  # such as: another process moves it away
+        return f"its files cannot be listed ({error.strerror})"
     for name, digest in recorded.items():
         try:
             if name not in files or sha256_of(files[name]) != digest:

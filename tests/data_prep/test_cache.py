@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -115,6 +116,22 @@ def test_several_at_once_all_succeed(offsets: tuple[int, int], tmp_path: Path) -
     subject = Subject.open(tmp_path / "out")
     assert subject.frame(len(subject) - 1).mouth_mask.max() > 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "subject"]
+
+
+def test_a_folder_that_is_moved_away_while_it_is_read_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by another process that prepares the same subject."""
+
+    def rglob(self: Path, pattern: str) -> Iterator[Path]:
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self / "mouth"))
+
+    prepared, _ = prepare_folder(write_tracked_folder(tmp_path / "subject", frames=12), tmp_path / "out")
+    inputs, said = prepared.manifest.input_hash, list[str]()
+    assert write_prepared.is_current(tmp_path / "out", inputs, is_chosen=True)
+    monkeypatch.setattr(Path, "rglob", rglob)
+    assert not write_prepared.is_current(tmp_path / "out", inputs, is_chosen=True, say=said.append)
+    assert "cannot be listed" in said[0]
 
 
 def test_nothing_is_left_over_where_several_take_one_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
