@@ -63,8 +63,8 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
                 break
             times.append(picture.time)
             brightest = max(brightest, float(picture.image[::4, ::4].mean()))
-            cuts.add(picture.image)
-            found.append([Face(face.points * scale, face.scores) for face in detector.find(picture.image)])
+            faces = detector.find(picture.image, cuts.add(picture.image))
+            found.append([Face(face.points * scale, face.scores) for face in faces])
     if len(times) < MIN_PICTURES:
         where = "" if span == Span() else " between --start and --end"
         raise UserError(
