@@ -40,7 +40,7 @@ class FirstPass:
 
 
 def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
-    """Find one person's face in the clip's longest shot. Raises UserError, with what to do, where there is none."""
+    """Find one person's face in the shot that shows one longest. Raises UserError, with what to do, where there is none."""
     notes: list[str] = []
     view = whole(footage.width, footage.height, DETECTION_SIDE)
     scale = np.array([footage.width / view.width, footage.height / view.height, footage.width / view.width], np.float32)
@@ -58,13 +58,13 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
     with FaceDetector() as detector:
         for picture in progress(footage.read(view, span, notes.append), expected, "looking for the face"):
             if len(times) == MAX_PICTURES:
-                notes.append(_too_long(footage, times[0], picture.time))
+                notes.append(_too_long(times[0], picture.time))
                 is_whole = False
                 break
             times.append(picture.time)
             brightest = max(brightest, float(picture.image[::4, ::4].mean()))
-            cuts.add(picture.image)
-            found.append([Face(face.points * scale, face.scores) for face in detector.find(picture.image)])
+            faces = detector.find(picture.image, cuts.add(picture.image))
+            found.append([Face(face.points * scale, face.scores) for face in faces])
     if len(times) < MIN_PICTURES:
         where = "" if span == Span() else " between --start and --end"
         raise UserError(
@@ -77,21 +77,22 @@ def look_at(footage: Footage, span: Span, progress: Progress) -> FirstPass:
             f"no face was found in any of the {len(times)} pictures of {footage.path}{_because(notes)}: {why}"
         )
     shots = [Shot(0, len(times))] if footage.is_joined else cuts.shots()
-    shot = _longest_shot(shots, np.array(times), found, notes)
+    shot = _shot_of_a_face(shots, np.array(times), found, notes)
     faces, about = follow_one(found[shot.start : shot.end])
     notes += about
     return _on_grid(footage, shot, np.array(times), faces, is_whole, notes)
 
 
-def _longest_shot(cut: list[Shot], times: np.ndarray, found: list[list[Face]], notes: list[str]) -> Shot:
+def _shot_of_a_face(cut: list[Shot], times: np.ndarray, found: list[list[Face]], notes: list[str]) -> Shot:
     """The shot with the most pictures of a face."""
     shots = [part for shot in cut for part in _without_pauses(shot, times)]
     best = max(shots, key=lambda shot: sum(map(bool, found[shot.start : shot.end])))
     if len(shots) > 1:
         seconds = times[best.end - 1] - times[best.start]
         notes.append(
-            f"the video is cut into {len(shots)} shots: the longest one with a face is used, {seconds:.1f} s from "
-            f"{times[best.start]:.1f} s on ({best.length} of {len(times)} pictures); --start and --end choose others"
+            f"the video is cut into {len(shots)} shots: the one with the most pictures of a face is used, "
+            f"{seconds:.1f} s from {times[best.start]:.1f} s on ({best.length} of {len(times)} pictures); --start and "
+            "--end choose others"
         )
     return best
 
@@ -139,11 +140,10 @@ def _on_grid(
     return FirstPass(landmarks, pictures, len(times), is_whole, notes, float(own[0]), between)
 
 
-def _too_long(footage: Footage, first: float, last: float) -> str:
-    whole_length = "" if footage.duration is None else f" of {footage.duration:.0f}"
+def _too_long(first: float, last: float) -> str:
     return (
-        f"the clip is longer than {MAX_PICTURES} pictures: the first {last - first:.0f} s{whole_length} are used; --start "
-        "and --end choose others"
+        f"the clip is longer than {MAX_PICTURES} pictures: those from {first:.1f} to {last:.1f} s are used; --start and "
+        "--end choose others"
     )
 
 

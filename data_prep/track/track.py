@@ -57,6 +57,7 @@ TURNED = "the pictures are turned by {} degrees clockwise, {}"
 COVERED = "the face looks unlike itself, as with a hand before it, at {} s"
 WITHOUT = "the mattes leave out most of the face in frames {}"
 LYING, GIVEN = "since the head lies in them (--rotate 0 leaves them)", "as --rotate says"
+NO_FACE, NO_PICTURE = "the person's face was not found", "the video has no picture at this time"
 
 
 def track(
@@ -197,7 +198,7 @@ def _camera(focal: Focal, view: View, footage: Footage, choices: Choices) -> tup
 
 def _left_out(look: FirstPass) -> dict[int, str]:
     lost = np.flatnonzero(~look.landmarks.detected).tolist()
-    return {n: "no face was found" if look.pictures[n] >= 0 else "the video has no picture at this time" for n in lost}
+    return {n: NO_FACE if look.pictures[n] >= 0 else NO_PICTURE for n in lost}
 
 
 @contextmanager

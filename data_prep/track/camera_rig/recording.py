@@ -120,8 +120,8 @@ def join_recordings(recordings: Sequence[Recording]) -> Recording:
     folders = [recording.folder.resolve() for recording in recordings]
     if len({folder.parent for folder in folders}) > 1 or len(set(folders)) < len(folders):
         raise UserError(
-            f"several recordings are tracked together where they are different sequences beside each other, as "
-            f"ID/sequences/EXP-1-head and ID/sequences/FREE; {recordings[-1].folder} and {first.folder} are not"
+            "several recordings are tracked together where they are different sequences beside each other, as "
+            f"ID/sequences/EXP-1-head and ID/sequences/FREE; {', '.join(str(one.folder) for one in recordings)} are not"
         )
     serials = [serial for serial in first.cameras if all(serial in one.cameras for one in recordings)]
     starts = [0.0]

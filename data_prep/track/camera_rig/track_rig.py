@@ -79,15 +79,15 @@ def track_rig(
     opened = _open(folders)
     if opened.sequences and span != WHOLE:
         raise UserError("--start and --end are of one sequence: leave them out, or track the sequences by themselves")
-    folder = opened.folder
+    folder, in_every = opened.folder, " in every sequence" if opened.sequences else ""
     if len(opened.cameras) < 2:
         raise UserError(
-            f"{folder} has pictures of one calibrated camera; two at least tell the head's size from its distance: copy "
-            "the others, or track a video of this one alone"
+            f"{folder} has pictures of {'one' if opened.cameras else 'no'} calibrated camera{in_every}; two at least tell "
+            "the head's size from its distance: copy the others, or track a video alone"
         )
     check_span(span, min((d for c in opened.cameras.values() if (d := c.footage.duration) is not None), default=None))
     if opened.unused:
-        say(f"note: calibrated cameras without pictures are left out: {', '.join(opened.unused)}")
+        say(f"note: calibrated cameras without pictures{in_every} are left out: {', '.join(opened.unused)}")
     front = find_front(opened, span)
     say(f"{folder}: {len(opened.cameras)} cameras; the front one is {front}")
     with growing(out) as stages:

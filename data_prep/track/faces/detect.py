@@ -76,8 +76,9 @@ class FaceDetector:
         """The same, of a picture whose face may be small."""
         return self.largest(image) or next(iter(self._in_parts(image)), None)
 
-    def find(self, image: UInt8[np.ndarray, "H W 3"]) -> list[Face]:
-        """The faces of a picture, the largest first; a small one is looked for around its last place and in parts."""
+    def find(self, image: UInt8[np.ndarray, "H W 3"], begins_shot: bool = False) -> list[Face]:
+        """The faces of a picture, the largest first; a small one is looked for around its last place, and in parts where it
+        has none or a shot begins."""
         height, width = image.shape[:2]
         faces: list[Face] = []
         if self._last is not None and self._last.height < _SMALL * max(width, height):
@@ -85,7 +86,7 @@ class FaceDetector:
         faces = faces or self._in_window(image, (0, 0, width, height))
         if not faces and self._last is not None:
             faces = self._in_window(image, _around(self._last, width, height))
-        if not faces and self._last is None and image[::8, ::8].std() > _FLAT:
+        if not faces and (self._last is None or begins_shot) and image[::8, ::8].std() > _FLAT:
             faces = self._in_parts(image)
         if faces:
             near = faces if self._last is None else [f for f in faces if overlap(f.box, self._last.box) > 0]

@@ -97,5 +97,8 @@ def _notes(chosen: Sequence[Face | None], others: Sequence[_Chain], returns: int
             "only; left out"
         )
     if returns:
-        notes.append(f"the face comes back after a while ({returns}x) and is taken as the same person's")
+        notes.append(
+            f"the face comes back after a while, or moves far between two pictures ({returns}x), and is taken as the same "
+            "person's"
+        )
     return notes

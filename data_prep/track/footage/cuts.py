@@ -32,11 +32,13 @@ class CutFinder:
         self._last: np.ndarray | None = None
         self._changes: list[float] = []
 
-    def add(self, image: UInt8[np.ndarray, "H W 3"]) -> None:
+    def add(self, image: UInt8[np.ndarray, "H W 3"]) -> bool:
+        """Whether the picture may begin a shot: it is much unlike the one before."""
         small = cv2.resize(image, THUMBNAIL, interpolation=cv2.INTER_AREA)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
         self._changes.append(0.0 if self._last is None else float(np.abs(grey - self._last).mean()))
         self._last = grey
+        return self._changes[-1] > _MIN_CHANGE
 
     def shots(self) -> list[Shot]:
         """The shots in their order; one where nothing is cut. A change counts as a cut when it is large and sudden."""

@@ -12,6 +12,7 @@ COMMON_RATES = (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 15.0, 12.5, 12.0, 
 _SNAP = 0.005  # relative: what time stamps in whole milliseconds do to a regular rate
 _SNAP_VARIABLE = 0.02
 _DRIFT = 0.25  # pictures at the end, by which a usual rate may be off: with more it is another one
+_MOST_OFF = 3.0  # places by which pictures may be off their numbers: with more, the rate changes slowly
 _SLACK = 0.75  # places by which a picture may be off its number
 _REGULAR = (0.5, 1.5)  # times the median distance, within which pictures are taken one by one
 
@@ -43,7 +44,9 @@ def regular_timing(times: Float[np.ndarray, " T"], stated: float | None = None) 
     if steps.min() >= low and steps.max() <= high:
         fps, slope = _common(float((T - 1) / (times[-1] - times[0]))), float(np.polyfit(np.arange(T), times, 1)[0])
         drift = (T - 1) * abs(slope * fps - 1)
-        return Timing(fps if drift <= _DRIFT else 1 / slope, np.arange(T), ())
+        fps = fps if drift <= _DRIFT else 1 / slope
+        if np.abs((times - times[0]) * fps - np.arange(T)).max() <= _MOST_OFF:
+            return Timing(fps, np.arange(T), ())
     usual = forward[(forward > 0.8 * median) & (forward < 1.2 * median)]
     if len(usual) == 0:  # the median lies between two distances that are as common: the shorter one
         usual = np.sort(forward)[len(forward) // 2 - 1 :][:1]

@@ -44,7 +44,7 @@ class MarkDetector:
             crown, chin = chin, crown
         return face_between(crown, chin)
 
-    def find(self, image: np.ndarray) -> list[Face]:
+    def find(self, image: np.ndarray, begins_shot: bool = False) -> list[Face]:
         face = self.anywhere(image)
         return [] if face is None else [face]
 

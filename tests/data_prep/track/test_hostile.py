@@ -172,7 +172,8 @@ TAKEN = {
     "two shots": Taken(
         lambda f: encode(f / "v.mp4", [*person()[:8], *person(2)]),
         (
-            "the video is cut into 2 shots: the longest one with a face is used, 0.8 s from 0.3 s on (20 of 28 pictures)",
+            "the video is cut into 2 shots: the one with the most pictures of a face is used, 0.8 s from 0.3 s on (20 of "
+            "28 pictures)",
         ),
     ),
     "portrait": Taken(lambda f: encode(f / "v.mp4", [wide(i) for i in person()]), size=(160, 260)),
@@ -238,5 +239,5 @@ def test_a_long_video_is_cut_at_the_limit(
     look = look_at(open_footage(encode(tmp_path / "v.mp4", person())), Span(), lambda items, total, title: items)
     assert len(look.landmarks) == 12 and not look.is_whole
     assert look.notes == [
-        "the clip is longer than 12 pictures: the first 0 s of 1 are used; --start and --end choose others"
+        "the clip is longer than 12 pictures: those from 0.0 to 0.5 s are used; --start and --end choose others"
     ]

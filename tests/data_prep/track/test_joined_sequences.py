@@ -12,6 +12,7 @@ from rig_recording import FILMED
 
 from avatar.cli import main
 from avatar.errors import UserError
+from avatar.head.assets import load_head_assets
 from data_prep.track.camera_rig import recording, track_rig
 from data_prep.track.camera_rig.camera_pictures import Times
 from data_prep.track.footage.source import Span, whole
@@ -61,6 +62,33 @@ def test_sequences_that_do_not_say_how_long_they_are_are_not_joined(raw: Path, t
     camera = opened[1].cameras[SERIALS[0]]
     opened[1].cameras[SERIALS[0]] = replace(camera, footage=replace(camera.footage, duration=None))
     with pytest.raises(UserError, match=f"FREE/images/cam_{SERIALS[0]}.mp4 does not say how long it is"):
+        recording.join_recordings(opened)
+
+
+def test_cameras_that_filmed_only_some_sequences_are_not_called_without_pictures(
+    raw: Path, tmp_path: Path, demo_head_model: Path
+) -> None:
+    first, free = sequences(raw, tmp_path)
+    head, said = load_head_assets(demo_head_model), []
+
+    def stopped(*_: object) -> str:
+        raise UserError("enough is said")
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(UserError, match="enough is said"):
+        patch.setattr(track_rig, "find_front", stopped)
+        track_rig.track_rig((first, free), tmp_path / "out", demo_head_model, head, say=said.append)
+    (note,) = said
+    assert "without pictures in every sequence" in note and SERIALS[2] in note
+    for serial in SERIALS[:2]:
+        (first / "images" / f"cam_{serial}.mp4").unlink()
+    with pytest.raises(UserError, match="pictures of no calibrated camera in every sequence"):
+        track_rig.track_rig((first, free), tmp_path / "out", demo_head_model, head)
+
+
+def test_all_recordings_are_named_where_one_of_them_is_not_beside_the_others(raw: Path, tmp_path: Path) -> None:
+    first, free = sequences(raw, tmp_path)
+    opened = [recording.open_recording(folder) for folder in (first, raw, free)]
+    with pytest.raises(UserError, match=f"{first}, {raw}, {free} are not"):
         recording.join_recordings(opened)
 
 

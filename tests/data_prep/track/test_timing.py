@@ -42,6 +42,15 @@ def test_jitter_of_a_telephone_drops_nothing() -> None:
     assert timing.numbers.tolist() == list(range(300)) and timing.fps == 30.0
 
 
+def test_a_rate_that_changes_once_keeps_the_pictures_at_their_times() -> None:
+    """As of a telephone that films fewer pictures in the dark."""
+    times = 2.0 + np.r_[np.arange(900) / 30, 30 + np.arange(720) / 24]
+    timing = regular_timing(times, 27.0)
+    used = timing.numbers >= 0
+    assert used.all() and np.abs(timing.numbers / timing.fps - (times - times[0])).max() < 1 / 30
+    assert timing.fps == 30.0 and "the frame rate varies (33 to 42 ms" in timing.notes[0]
+
+
 def test_a_variable_rate_leaves_gaps_and_drops_between() -> None:
     times = np.array([0, 1, 2, 3, 7, 8, 8.3, 8.9, 10, 11, 12, 13]) / 25
     timing = regular_timing(times)
