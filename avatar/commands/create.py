@@ -74,7 +74,7 @@ def run_create(arguments: Namespace) -> int:
         print("Start the same command again to go on.")
         return status
     say_stage(4, "the avatar is measured, and its page written")
-    results = evaluate_or_read(run)
+    results = evaluate_or_read(run, None if plan_file(run).exists() else subject)
     write_page(open_trained(run), page)
     print(f"Held-out frames: {figures_line(results)}")
     print(f"\nDone in {(time.monotonic() - begin) / 60:.1f} minutes. Open {page}, the avatar in a browser.")

@@ -182,6 +182,17 @@ def test_the_minutes_count_every_part() -> None:
     assert create.training_seconds(config, 0, 1000, 800, "cuda") < alone
 
 
+def test_a_folder_that_has_moved_is_measured_where_it_is_now(
+    small: Callable[..., None], video: Path, tracked_folder: Path
+) -> None:
+    small(GOOD)
+    words, moved = ("create", video, "--head", tracked_folder / "head_model", "--refine", 0), video.parent / "moved"
+    avatar(*words, "--out", video.parent / "me")
+    (video.parent / "me").rename(moved)
+    (moved / "avatar.html").unlink()
+    assert "Done in" in avatar(*words, "--out", moved) and (moved / "avatar.html").is_file()
+
+
 def test_the_minutes_of_a_command_that_goes_on_count_the_rounds_that_it_began_with(tmp_path: Path) -> None:
     subject, run, arguments = tmp_path / "subject", tmp_path / "run", parse(["create", "me.mp4"])
     assert create.training_arguments(arguments, subject, run).refine == create.ROUNDS
