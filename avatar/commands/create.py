@@ -28,7 +28,7 @@ from avatar.head.assets import HeadAssets, load_head_assets
 from avatar.pipeline import OK
 from avatar.pipeline.cached_tracking import head_for_video, progress_bar, tracking_lacks
 from avatar.pipeline.choose_device import choose_device
-from avatar.pipeline.refine_plan import plan_file, round_steps
+from avatar.pipeline.refine_plan import Plan, plan_file, round_steps
 from avatar.pipeline.train_refined import is_begun
 from avatar.runs.memory_estimate import training_needs
 from avatar.runs.run import open_trained
@@ -74,7 +74,7 @@ def run_create(arguments: Namespace) -> int:
         print("Start the same command again to go on.")
         return status
     say_stage(4, "the avatar is measured, and its page written")
-    results = evaluate_or_read(run)
+    results = evaluate_or_read(run, None if plan_file(run).exists() else subject)
     write_page(open_trained(run), page)
     print(f"Held-out frames: {figures_line(results)}")
     print(f"\nDone in {(time.monotonic() - begin) / 60:.1f} minutes. Open {page}, the avatar in a browser.")
@@ -110,8 +110,8 @@ def training_arguments(arguments: Namespace, subject: Path, run: Path) -> Namesp
     begun, has_rounds = is_begun(run), plan_file(run).exists()
     if given["refine"] is not None and not 0 <= given["refine"] <= MAX_ROUNDS:
         raise UserError(f"--refine must be from 0 to {MAX_ROUNDS}, not {given['refine']}")
-    if given["refine"] is None and not begun and not has_rounds:
-        given["refine"] = ROUNDS
+    if given["refine"] is None:
+        given["refine"] = Plan.load(run).rounds if has_rounds else None if begun else ROUNDS
     if given["refine"] == 0 and not has_rounds:
         given["refine"] = None
     words = [f"--{name}={value}" for name, value in given.items() if value is not None]

@@ -13,12 +13,13 @@ from avatar.files.read import read_json
 from avatar.pipeline.open_inputs import open_run
 
 
-def evaluate_or_read(path: Path) -> Path:
-    """RUN/eval/results.json of a run, by all protocols; what was measured already is not measured again.
+def evaluate_or_read(path: Path, video: Path | None = None) -> Path:
+    """RUN/eval/results.json of a run, by all protocols; what was measured already is not measured again. `video` is where
+    its tracked folder is now, which may have moved.
 
     Raises UserError as `evaluate` does.
     """
-    run, folder = open_run(path, say=discard), path / "eval"
+    run, folder = open_run(path, folder=video, say=discard), path / "eval"
     if builtin_protocols().keys() <= read_earlier(folder, facts_of(run), ()).entries.keys():
         return folder / "results.json"
     with writing_figures(path):

@@ -87,23 +87,22 @@ class Recording:
         """`image_size` of the camera whose shorter side is the least."""
         return min((one.image_size(size) for one in self.cameras), key=min)
 
-    def camera(self, index: int, size: int | None = None) -> Camera:
-        """The camera of a frame; it holds the head's pose."""
-        if self.rig is None:
-            return self.reference_camera(index, size)
-        row = self.time(index)
-        camera = self.rig.cameras[self.rig.views[index]].sees(self.tracks["R"][row], self.tracks["t"][row])
-        return camera if size is None else camera.resized(*self.image_size(size, index))
+    def camera(self, index: int, size: int | None = None, view: int | None = None) -> Camera:
+        """The camera of a frame; it holds the head's pose.
 
-    def reference_camera(self, index: int, size: int | None = None) -> Camera:
-        """The first camera at a frame's time, whether it filmed the frame or not."""
-        row = self.time(index)
+        view  which camera, whether it filmed the frame or not; None: the one that did
+        """
+        row, view = self.time(index), self.view(index) if view is None else view
         R, t = self.tracks["R"][row], self.tracks["t"][row]
         if self.rig is None:
             camera = Camera(R, t, *self.intrinsics, width=self.width, height=self.height)
         else:
-            camera = self.rig.cameras[0].sees(R, t)
-        return camera if size is None else camera.resized(*self.cameras[0].image_size(size))
+            camera = self.rig.cameras[view].sees(R, t)
+        return camera if size is None else camera.resized(*self.cameras[view].image_size(size))
+
+    def reference_camera(self, index: int, size: int | None = None) -> Camera:
+        """The first camera at a frame's time, whether it filmed the frame or not."""
+        return self.camera(index, size, 0)
 
     def params(self, index: int) -> HeadParams:
         row = self.time(index)

@@ -20,7 +20,7 @@ FRAMES_FILE, TRACKED_FILE = "frames.csv", "tracked.csv"
 OF_TRACKERS = "trackers fit each frame to its own picture, held out or not"
 FITTED = "each frame, measured ones too, was then fitted to its own picture"
 FITTED_BY_RIG = (
-    "each time, measured ones too, was then fitted to pictures of cameras that are trained on, if it has any"
+    "each time, measured ones too, was then fitted to pictures of cameras that are trained on, if it has any,"
 )
 OF_REFINEMENT = "through the avatar of another run"
 LABELS: dict[Drive, str] = {"tracked": "tracked", "refined": "refined, fitted"}  # of the figures in tables

@@ -17,6 +17,7 @@ from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 from torch import Tensor
 
 from avatar.errors import UserError
+from avatar.files.names import as_text
 from avatar.files.pickles import load_npz, save_npz
 from avatar.head.assets import HeadAssets
 from avatar.motion.drive import Drive
@@ -103,7 +104,8 @@ def write_drive(path: Path, drive: Drive, fingerprint: str) -> None:
         name: torch.stack([getattr(params, name) for params in drive.params]).numpy()
         for name in ("expression", "jaw", "eyes", "eyelids", "neck")
     }
-    arrays |= {"fps": np.array(drive.fps), "names": np.array(drive.names), "head": np.array(fingerprint)}
+    names = [as_text(name) for name in drive.names]
+    arrays |= {"fps": np.array(drive.fps), "names": np.array(names), "head": np.array(fingerprint)}
     arrays["shape"] = drive.identity.numpy()
     if drive.cameras is not None:
         first = drive.cameras[0]

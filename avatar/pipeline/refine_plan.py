@@ -14,6 +14,7 @@ from avatar.compute.device import CPU
 from avatar.config import load_config
 from avatar.data.json_values import parse_object
 from avatar.data.source import Source
+from avatar.data.split import check_divided
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.names import ROUNDS_FOLDER
@@ -122,6 +123,7 @@ def steps_in_time(
     """
     config = load_config(overrides)
     subject, assets = open_subject(source, config.data.test_frames, test_cameras=config.data.test_cameras)
+    check_divided(subject.split)
     frames = len(subject.split.train)
     asked = within_epochs(config.trainer, frames).iterations
     # What a GPU takes, the first round shows.

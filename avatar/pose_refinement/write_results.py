@@ -15,6 +15,7 @@ from torch import Tensor
 from avatar.data.recording import Recording
 from avatar.data.split import evenly_spread
 from avatar.data.subject import Subject
+from avatar.files.names import as_text
 from avatar.files.video import ERROR_SCALE, error_map, padded, side_by_side
 from avatar.files.write_image import encode_image
 from avatar.gaussians.base_model import Avatar
@@ -38,7 +39,8 @@ def frames_csv(subject: Subject, refined: Refined, centre: Float[Tensor, " 3"]) 
     parts = {row: part for part, rows in _rows_of_parts(recording).items() for row in rows}
     for row, (index, *_) in enumerate(fitted_pictures(recording)):
         figures = (refined.before[row], refined.after[row], math.degrees(turns[row]), 1e3 * shifts[row])
-        writer.writerow((row, recording.names[index], parts.get(row, ""), *(f"{figure:.4f}" for figure in figures)))
+        name, shown = as_text(recording.names[index]), (f"{figure:.4f}" for figure in figures)
+        writer.writerow((row, name, parts.get(row, ""), *shown))
     return text.getvalue()
 
 

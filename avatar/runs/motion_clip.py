@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from avatar.data.recording import Recording
 from avatar.errors import UserError
 from avatar.head.model import HeadModel
 from avatar.motion.drive import Drive, choose_cameras
@@ -35,24 +34,19 @@ class Clip:
 def own_clip(trained: TrainedAvatar, which: str, size: int | None = None) -> Clip:
     """The held-out frames, those of training, or all of them (`which` of OWN), one of each time; `size` pixels wide.
 
-    Raises UserError where there are none.
+    With several cameras all are seen by the one that has most of them. Raises UserError where there are none.
     """
     recording = trained.recording
     split = recording.split
     indices: Sequence[int] = {"test": split.test, "train": split.train, "all": range(len(recording))}[which]
     if len(indices) == 0:
         raise UserError(f"the video of {recording.name} has no {which} frames")
-    shown = _moments_of_a_camera(recording, indices)
-    frames = [(recording.params(i), recording.camera(i, size)) for i in shown]
-    return Clip(which, recording.fps, frames, shown)
-
-
-def _moments_of_a_camera(recording: Recording, indices: Sequence[int]) -> tuple[int, ...]:
-    """`Recording.moments`, but by the camera that has most of the frames, where it has one: a film does not jump."""
-    counts = Counter(recording.view(index) for index in indices)
+    counts = Counter(map(recording.view, indices))
     most = min(counts, key=lambda view: (-counts[view], view))
-    by_time = {recording.time(index): index for index in indices if recording.view(index) == most}
-    return tuple(by_time.get(recording.time(index), index) for index in recording.moments(indices))
+    filmed = {recording.time(index): index for index in indices if recording.view(index) == most}
+    shown = tuple(filmed.get(recording.time(index), index) for index in recording.moments(indices))
+    frames = [(recording.params(i), recording.camera(i, size, most)) for i in shown]
+    return Clip(which, recording.fps, frames, shown)
 
 
 def driven_clip(trained: TrainedAvatar, drive: Drive, size: int | None = None) -> Clip:

@@ -63,14 +63,14 @@ class Job:
         """What `asdict` gave. Raises KeyError, TypeError or ValueError for anything else: each value becomes a word of a
         command, and no word may be read as an option."""
         job = cls(**{**raw, "overrides": tuple(raw["overrides"]), "protocols": tuple(raw["protocols"])})
-        source, texts = job.source, (job.name, job.subject, job.variant)
+        source, texts = job.source, (job.name, job.subject, job.variant, *job.overrides, *job.protocols)
         if not isinstance(source, dict) or not isinstance(source["folder"], str) or source.keys() - SUBJECT_KEYS:
             raise TypeError("source is no table with a folder")
         words = [*job.overrides, *job.protocols, *source.values()]
         if wrong := [word for word in words if not _is_word(word)]:
             raise ValueError(f"{str(wrong[0])[:40]!r} is no word")
         if not all(isinstance(text, str) for text in texts) or job.name in ("", ".", ".."):
-            raise TypeError("a name is not text")
+            raise TypeError("a name or an override is not text")
         return job
 
 

@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from avatar.data.json_values import parse_object
 from avatar.errors import UserError
 from avatar.files.atomic import write_atomically
 from avatar.files.read import MissingFile, read_json
@@ -77,7 +78,7 @@ def read_sweep(folder: Path) -> Spec:
     """The sweep in a folder. Raises UserError where there is none."""
     raw = _read_sweep_file(folder)
     try:
-        resources = Resources(**raw["resources"])
+        resources = parse_object({**asdict(Resources()), **raw["resources"]}, Resources, "resources")
         return Spec(
             tuple(read_job(folder / "jobs" / str(name)) for name in raw["jobs"]), resources, int(raw["retries"])
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -13,10 +13,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from avatar.files.video import error_map
+from avatar.files.video import error_map, fitted
 from avatar.head.rasterize import rasterize_mesh
 from avatar.motion.controls import JOINT_FIELD, joint_ranges, joint_values, posed
 from avatar.motion.orbit import orbited
+from avatar.runs.motion_clip import Clip
 from avatar.runs.trained_avatar import TrainedAvatar
 from avatar.splat import checked_drawings
 from avatar.tensors import to_8_bit
@@ -111,7 +112,10 @@ class ViewRenderer:
         With the truth or the error, which exist for frames of the video only, they stand at its right.
         """
         params = self.params(frame[0], setting)
-        own = frame[1].resized(width, max(1, round(width * frame[1].height / frame[1].width)))
+        seen, truth = frame[1], None
+        if self.truth is not None and recorded is not None and (setting.with_truth or setting.overlay == "error"):
+            seen, truth = self.trained.recording.camera(recorded), self.truth(recorded, width)  # of one camera
+        own = seen.resized(width, max(1, round(width * seen.height / seen.width)))
         look, _ = self.within(setting.look)
         camera = orbited(own, look.yaw, look.pitch, look.zoom)
         with checked_drawings():
@@ -119,8 +123,7 @@ class ViewRenderer:
         if setting.overlay == "mesh":
             _draw_mesh(picture, self.trained.avatar.vertices(params).cpu(), self.trained.assets.faces, camera)
         beside = [picture]
-        if self.truth is not None and recorded is not None and (setting.with_truth or setting.overlay == "error"):
-            truth = self.truth(recorded, width)
+        if truth is not None:
             if setting.with_truth:
                 beside.append(to_8_bit(truth).numpy())
             if setting.overlay == "error":  # of the recorded view, whatever the camera
@@ -128,6 +131,14 @@ class ViewRenderer:
                     drawn = self.rendered(frame[0], own).image.cpu()
                 beside.append(to_8_bit(error_map(drawn, truth)).numpy())
         return np.concatenate(beside, axis=1)
+
+    def film(self, clip: Clip, setting: Setting, width: int) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        """The whole clip as `draw` shows it, in pictures of one size: the truths of several cameras may have several."""
+        size = None
+        for frame, recorded in zip(clip.frames, clip.recorded or (None,) * len(clip), strict=True):
+            picture = self.draw(frame, setting, width, recorded)
+            size = size or picture.shape[:2]
+            yield to_8_bit(fitted(torch.from_numpy(picture) / 255.0, *size)).numpy()
 
     @torch.no_grad()
     def rendered(self, params: HeadParams, camera: Camera) -> Rendering:

@@ -213,10 +213,10 @@ class Viewer:
             return
 
         def frames() -> Iterator[np.ndarray]:
-            for frame, recorded in zip(clip.frames, clip.recorded or (None,) * len(clip), strict=True):
+            for picture in renderer.film(clip, setting, self._width):
                 if self._stop.is_set():
                     raise UserError("the viewer has ended")
-                yield renderer.draw(frame, setting, self._width, recorded)
+                yield picture
 
         with self._saving(event.client) as may_save, tempfile.TemporaryDirectory() as folder:
             if may_save:

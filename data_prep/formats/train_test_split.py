@@ -118,9 +118,8 @@ def named_cameras(names: str | None, cameras: Collection[str]) -> set[str] | Non
 def _named(names: Sequence[str], cameras: Collection[str]) -> set[str]:
     found = set()
     for name in (word.strip() for word in names):
-        same = [
-            one for one in cameras if one == name or (one.isdecimal() and name.isdecimal() and int(one) == int(name))
-        ]
+        alike = (one for one in cameras if one.isdecimal() and name.isdecimal() and int(one) == int(name))
+        same = [name] if name in cameras else list(alike)
         if not same:
             raise UserError(f"there is no camera {name!r} among {', '.join(sorted(cameras))}")
         found.add(same[0])

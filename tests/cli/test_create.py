@@ -22,8 +22,10 @@ from small_runs import SMALL
 from avatar.commands import create
 from avatar.commands.arguments import parse
 from avatar.config import Config
+from avatar.data.source import Source
 from avatar.files.third_party import FOLDER_VARIABLE
 from avatar.files.video import video_writer
+from avatar.pipeline.refine_plan import Plan
 from data_prep.formats.avatar_track import TrackingInfo
 from data_prep.prepare.open_subject import HEAD_VARIABLE
 from data_prep.track.footage.picture_folder import open_footage
@@ -178,6 +180,25 @@ def test_the_minutes_count_every_part() -> None:
     assert create.training_seconds(config, 1, 1000, 800, "cpu") == pytest.approx(99 / 4000 * 5000 + 79)
     assert create.training_seconds(config, 0, 100, 80, "cpu") == pytest.approx(99 / 4000 * 800), "ten passes"
     assert create.training_seconds(config, 0, 1000, 800, "cuda") < alone
+
+
+def test_a_folder_that_has_moved_is_measured_where_it_is_now(
+    small: Callable[..., None], video: Path, tracked_folder: Path
+) -> None:
+    small(GOOD)
+    words, moved = ("create", video, "--head", tracked_folder / "head_model", "--refine", 0), video.parent / "moved"
+    avatar(*words, "--out", video.parent / "me")
+    (video.parent / "me").rename(moved)
+    (moved / "avatar.html").unlink()
+    assert "Done in" in avatar(*words, "--out", moved) and (moved / "avatar.html").is_file()
+
+
+def test_the_minutes_of_a_command_that_goes_on_count_the_rounds_that_it_began_with(tmp_path: Path) -> None:
+    subject, run, arguments = tmp_path / "subject", tmp_path / "run", parse(["create", "me.mp4"])
+    assert create.training_arguments(arguments, subject, run).refine == create.ROUNDS
+    Plan(2, Source(subject, tmp_path), (), None, 100, 50).save(run)
+    again = create.training_arguments(arguments, subject, run)
+    assert again.refine == 2 and again.resume
 
 
 # For each line, a folder: a process that makes it, its number and how it ended. It has imported all before.

@@ -67,9 +67,11 @@ def test_a_single_frame_makes_a_drive_file(still: Path, tmp_path: Path) -> None:
 
 
 def test_a_single_frame_is_not_trained_on(still: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", str(still), "--frame-offset", "1", "--out", str(tmp_path / "run")]) == 1
-    assert "the subject has 1 usable frame(s); at least 2 are needed, one to train" in capsys.readouterr().err
-    assert not (tmp_path / "run" / "run.json").exists()
+    words = ["train", str(still), "--frame-offset", "1", "--out", str(tmp_path / "run")]
+    for more in ([], ["--refine", "1"]):
+        assert main([*words, *more]) == 1
+        assert "the subject has 1 usable frame(s); at least 2 are needed, one to train" in capsys.readouterr().err
+        assert not (tmp_path / "run").exists()
     assert main(["check", str(still), "--frame-offset", "1", "--json"]) == 2
     findings = json.loads(capsys.readouterr().out)["findings"]
     assert [one["check"] for one in findings if one["severity"] == "error"] == ["too-few-frames"]

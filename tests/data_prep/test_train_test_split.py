@@ -11,7 +11,7 @@ from avatar.data.split import Split
 from avatar.errors import UserError
 from data_prep.formats.frame_files import FrameFiles
 from data_prep.formats.tracked_folder import Shot, TrackedFolder
-from data_prep.formats.train_test_split import chosen_cameras, split_frames_of
+from data_prep.formats.train_test_split import chosen_cameras, named_cameras, split_frames_of
 
 CAMERAS = ("07", "08", "12")
 
@@ -27,6 +27,10 @@ CAMERAS = ("07", "08", "12")
 )
 def test_cameras_are_chosen_by_name_or_number(chosen: str, cameras: set[str], notes: tuple[str, ...]) -> None:
     assert chosen_cameras(chosen, CAMERAS, lambda: "08", Path("x")) == (cameras, notes)
+
+
+def test_a_camera_of_just_this_name_comes_before_one_of_its_number() -> None:
+    assert named_cameras("7", ("07", "7")) == {"7"} and named_cameras("07", ("7", "07")) == {"07"}
 
 
 def test_a_camera_that_there_is_not_is_named_with_those_that_there_are() -> None:

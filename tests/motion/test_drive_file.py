@@ -59,6 +59,12 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert (smaller.cameras[0].width, smaller.cameras[0].height, smaller.cameras[0].fx) == (64, 48, 100)
 
 
+def test_frames_whose_names_are_not_utf_8_are_read_back_under_names_that_are(tmp_path: Path) -> None:
+    drive = Drive("d", 30.0, ("caf\udce9_1", "b"), [random_params(seed) for seed in range(2)], None, torch.zeros(0))
+    write_drive(tmp_path / "d.npz", drive, ASSETS.fingerprint)
+    assert read(tmp_path / "d.npz")[0].names == (r"caf\udce9_1", "b")
+
+
 def test_little_is_enough_and_short_vectors_are_padded_aloud(tmp_path: Path) -> None:
     drive, said = read(npz(tmp_path / "d.npz", expression=[[1.0, 2.0], [3.0, 4.0]], jaw=[[0.2, 0, 0], [0, 0, 0]]))
     assert "has 2 of 5 expression coefficients; the rest are zero" in said

@@ -234,6 +234,8 @@ def test_the_record_tells_what_happened(avatar: Avatar, wrong: Clip, result: Ref
     assert tuple(rows[0]) == COLUMNS and len(rows) == 11
     assert rows[8][:3] == ["7", "00008", "test"] and float(rows[8][3]) == pytest.approx(result.before[7], abs=1e-4)
     assert 0.05 < float(rows[8][5]) < 2.0 and 0.05 < float(rows[8][6]) < 5.0
+    odd = Clip(replace(wrong.recording, names=("caf\udce9",) * 10), wrong.pictures, wrong.manifest)
+    assert rb"7,caf\udce9,test" in frames_csv(cast(Subject, odd), result, centre).encode()
     lines = "\n".join(summary(cast(Subject, wrong), result, centre))
     assert f"{result.before[:7].mean():.2f} -> {result.after[:7].mean():.2f} dB" in lines
     assert "as they were" not in lines

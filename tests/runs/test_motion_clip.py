@@ -54,8 +54,18 @@ def test_a_film_of_held_out_frames_is_of_one_camera() -> None:
     assert own_clip(trained, "all").recorded == (0, 2, 4, 6, 8, 10)
 
 
-def test_a_time_that_the_camera_did_not_film_is_seen_by_another() -> None:
-    assert own_clip(filmed_by_two((2, 5, 7, 9)), "test").recorded == (2, 5, 7, 9)
+def test_a_time_that_the_camera_did_not_film_is_seen_by_it_too() -> None:
+    """The picture that is beside it is another camera's."""
+    trained = filmed_by_two((2, 5, 7, 9))
+    clip = own_clip(trained, "test")
+    assert clip.recorded == (2, 5, 7, 9)
+    for size, side in ((None, 48), (24, 24)):
+        cameras = [camera for _, camera in own_clip(trained, "test", size).frames]
+        assert {(camera.width, camera.height, camera.fx) for camera in cameras} == {(side, side, 2.0 * side)}
+    assert all(
+        torch.equal(camera.t_cam_world, trained.recording.tracks["t"][time])
+        for time, (_, camera) in enumerate(clip.frames, start=1)
+    )
 
 
 def test_before_a_camera_that_stands_still_the_torso_does_too(tracked_folder: Path, tmp_path: Path) -> None:

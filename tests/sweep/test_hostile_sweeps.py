@@ -14,7 +14,7 @@ from watch import memory_cap
 from avatar.errors import UserError
 from avatar.evaluation.protocol import builtin_protocols, read_protocol
 from avatar.files.plain_yaml import MAX_NODES, read_yaml
-from avatar.sweep.spec import MAX_VARIANTS, Job, read_spec
+from avatar.sweep.spec import MAX_VARIANTS, Job, Resources, read_spec
 from avatar.sweep.state import read_job, read_sweep
 
 pytestmark = pytest.mark.slow
@@ -92,6 +92,7 @@ HOSTILE_JOBS: dict[str, dict[str, Any]] = {
     "an unknown part of a source": {"source": {"folder": "/f", "out": "/elsewhere"}},
     "overrides that are a number": {"overrides": 3},
     "a table among the overrides": {"overrides": [{}]},
+    "a number among the overrides": {"overrides": [1]},
     "no name": {"name": 3},
 }
 
@@ -105,6 +106,16 @@ def test_a_hostile_job_is_refused(name: str, tmp_path: Path) -> None:
     (folder / "job.json").write_text(json.dumps({**JOB, **HOSTILE_JOBS[name]}))
     with pytest.raises(UserError, match="is damaged"):
         read_job(folder)
+
+
+@pytest.mark.parametrize("wrong", [{"threads": "2"}, {"memory_gb": None}, {"gpus": []}, [3]])
+def test_resources_of_another_kind_are_refused(wrong: object, tmp_path: Path) -> None:
+    content = {"format": 1, "jobs": [], "resources": {"threads": 2}, "retries": 0}
+    (tmp_path / "sweep.json").write_text(json.dumps(content))
+    assert read_sweep(tmp_path).resources == Resources()
+    (tmp_path / "sweep.json").write_text(json.dumps({**content, "resources": wrong}))
+    with pytest.raises(UserError, match=r"sweep\.json is damaged"):
+        read_sweep(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["../../elsewhere", "..", "", "/elsewhere", "a/../../../elsewhere"])

@@ -10,6 +10,7 @@ import pytest
 import torch
 from lively import lively_avatar
 
+from avatar.data.camera_rig import CameraRig, RigCamera
 from avatar.motion.controls import joint_values, posed
 from avatar.motion.orbit import orbited
 from avatar.runs.motion_clip import own_clip
@@ -91,6 +92,27 @@ def test_overlays(renderer: ViewRenderer, trained: TrainedAvatar) -> None:
     assert renderer.draw(frame, Setting(overlay="error", with_truth=True), WIDTH).shape == plain.shape, (
         "no truth of other motion"
     )
+
+
+def test_beside_a_truth_the_avatar_is_seen_by_the_camera_that_filmed_it(trained: TrainedAvatar) -> None:
+    """The second camera, whose pictures are flatter, lacks time 2; a film stays of one size all the same."""
+    own = trained.recording
+    lenses = [
+        RigCamera(name, own.width, height, own.intrinsics) for name, height in (("a", own.width), ("b", own.width // 2))
+    ]
+    views = tuple(int(time != 2) for time in range(len(own)))
+    recording = replace(own, rig=CameraRig(tuple(lenses), tuple(range(len(own))), views))
+    filmed = replace(trained, recording=recording)
+    renderer = ViewRenderer(filmed, lambda i, width: torch.zeros(recording.image_size(width, i)[1], width, 3))
+    clip = own_clip(filmed, "train")
+    drawn = renderer.draw(clip.frames[2], Setting(with_truth=True), WIDTH, 2)
+    expected = filmed.render(recording.params(2), recording.camera(2, WIDTH)).image
+    np.testing.assert_array_equal(drawn[:, :WIDTH], to_8_bit(expected).numpy())
+    short = replace(clip, frames=clip.frames[:4], recorded=(0, 1, 2, 3))
+    assert {picture.shape for picture in renderer.film(short, Setting(), WIDTH)} == {(WIDTH // 2, WIDTH, 3)}
+    beside = list(renderer.film(short, Setting(with_truth=True), WIDTH))
+    assert {picture.shape for picture in beside} == {(WIDTH // 2, 2 * WIDTH, 3)}
+    np.testing.assert_array_equal(beside[1], renderer.draw(clip.frames[1], Setting(with_truth=True), WIDTH, 1))
 
 
 def test_overlays_that_an_avatar_does_not_have(trained: TrainedAvatar, renderer: ViewRenderer) -> None:
